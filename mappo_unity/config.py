@@ -1,0 +1,293 @@
+"""Every option, as one dataclass field with its type, default and description.
+
+In: nothing. Out: `Config` and its sections, checked when they are built from a composed
+configuration. This module must stay importable without torch, so that ``--help`` and errors
+about options come at once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Optional
+
+
+class ConfigError(ValueError):
+    """A mistake in the options; the message names the option, its value and the rule."""
+
+
+class Backend(Enum):
+    """What runs the environment."""
+
+    embedded = "embedded"
+    custom = "custom"
+
+
+class Activation(Enum):
+    """Nonlinearity between hidden layers."""
+
+    tanh = "tanh"
+    relu = "relu"
+    silu = "silu"
+    elu = "elu"
+
+
+class Optimizer(Enum):
+    """Optimizer of the networks."""
+
+    adam = "adam"
+    adamw = "adamw"
+
+
+class Schedule(Enum):
+    """How a quantity moves from its start to its end over `max_steps`."""
+
+    constant = "constant"
+    linear = "linear"
+    cosine = "cosine"
+
+
+class ValueLoss(Enum):
+    """Distance between the critic's output and its target."""
+
+    huber = "huber"
+    mse = "mse"
+
+
+class LogBackend(Enum):
+    """Where metrics go besides ``metrics.csv``."""
+
+    csv = "csv"
+    tensorboard = "tensorboard"
+    wandb = "wandb"
+    mlflow = "mlflow"
+
+
+@dataclass
+class EnvConfig:
+    """The environment."""
+
+    name: str = "3DBall"
+    """Name of the environment: a preset in conf/env, also the name of the run's folder."""
+    backend: Backend = Backend.embedded
+    """What runs it: an embedded scene, or a simulator of your own (custom)."""
+    num_areas: Optional[int] = None
+    """Copies of the playing area inside one environment; null: as many as the Unity scene has."""
+    params: dict[str, Any] = field(default_factory=dict)
+    """Environment parameters (env.params.mass=2) of the scene, or arguments of env.factory."""
+    factory: Optional[str] = None
+    """With backend=custom: package.module:function, called as function(seed=..., **env.params)."""
+    max_team_size: Optional[int] = None
+    """Agent slots of a team; null: the largest team seen at the start."""
+    max_teams: Optional[int] = None
+    """Team slots of a behavior; null: as many as are seen at the start."""
+
+    def __post_init__(self) -> None:
+        _at_least("env.num_areas", self.num_areas, 1)
+        _at_least("env.max_team_size", self.max_team_size, 1)
+        _at_least("env.max_teams", self.max_teams, 1)
+        if self.backend is Backend.custom and not self.factory:
+            raise ConfigError(
+                "env.factory is not given, but env.backend=custom needs it: "
+                "env.factory=package.module:function, a function that returns a BaseEnv"
+            )
+        if self.factory is not None and self.factory.count(":") != 1:
+            raise ConfigError(
+                f"env.factory={self.factory!r} is not of the form package.module:function"
+            )
+
+
+@dataclass
+class ModelConfig:
+    """The actor's and the critic's networks."""
+
+    hidden: list[int] = field(default_factory=lambda: [128, 128])
+    """Widths of the hidden layers."""
+    critic_hidden: Optional[list[int]] = None
+    """Widths of the critic's hidden layers; null: as model.hidden."""
+    activation: Activation = Activation.tanh
+    """Nonlinearity between hidden layers."""
+    normalize_obs: bool = True
+    """Normalise observations by running mean and variance, inside the network."""
+    init_log_std: float = 0.0
+    """Logarithm of the initial standard deviation of continuous actions (before the division by 3)."""
+
+    def __post_init__(self) -> None:
+        for option, widths in (
+            ("model.hidden", self.hidden),
+            ("model.critic_hidden", self.critic_hidden or [1]),
+        ):
+            if not widths or any(width < 1 for width in widths):
+                raise ConfigError(
+                    f"{option}={list(widths)} must be a list of at least one width, each >= 1, "
+                    f"for example {option}=[128,128]"
+                )
+        _within("model.init_log_std", self.init_log_std, -10, 3)
+
+
+@dataclass
+class PPOConfig:
+    """The learner."""
+
+    lr: float = 3e-4
+    """Learning rate at the start."""
+    lr_schedule: Schedule = Schedule.linear
+    """How the learning rate falls to ppo.lr_final over max_steps."""
+    lr_final: float = 0.0
+    """Learning rate at the end of its schedule."""
+    optimizer: Optimizer = Optimizer.adam
+    """Optimizer of the networks."""
+    weight_decay: float = 0.0
+    """Weight decay of the optimizer."""
+    gamma: float = 0.99
+    """Discount of a decision."""
+    gae_lambda: float = 0.95
+    """Lambda of generalised advantage estimation."""
+    clip_epsilon: float = 0.2
+    """Half-width of the ratio's clipping interval at the start."""
+    clip_schedule: Schedule = Schedule.constant
+    """How the clipping interval falls to ppo.clip_epsilon_final over max_steps."""
+    clip_epsilon_final: float = 0.1
+    """Clipping interval at the end of its schedule."""
+    epochs: int = 3
+    """Passes over a batch."""
+    minibatch_size: int = 1024
+    """Agent decisions (agent slots of whole team rows) in a minibatch."""
+    entropy_coef: float = 0.0
+    """Weight of the entropy bonus at the start."""
+    entropy_schedule: Schedule = Schedule.linear
+    """How the entropy weight falls to ppo.entropy_coef_final over max_steps."""
+    entropy_coef_final: float = 0.0
+    """Entropy weight at the end of its schedule."""
+    value_coef: float = 0.5
+    """Weight of the value loss."""
+    value_loss: ValueLoss = ValueLoss.huber
+    """Distance between the critic's output and its target."""
+    huber_delta: float = 10.0
+    """Where the Huber loss turns linear, in units of the critic's (normalised) output."""
+    clip_value: bool = False
+    """Clip the move of the critic's output by the clipping interval."""
+    normalize_values: bool = True
+    """The critic learns returns normalised by running statistics."""
+    normalize_advantages: bool = True
+    """Normalise advantages over the acting agents of a batch."""
+    max_grad_norm: float = 0.5
+    """Gradients are scaled down to this norm."""
+    target_kl: Optional[float] = None
+    """Stop an update's remaining epochs when the approximate KL exceeds this; null: never."""
+    max_kl: float = 1.0
+    """Roll an update back when the approximate KL exceeds this or a number is not finite."""
+
+    def __post_init__(self) -> None:
+        _above("ppo.lr", self.lr, 0)
+        _at_least("ppo.lr_final", self.lr_final, 0)
+        _at_least("ppo.weight_decay", self.weight_decay, 0)
+        _within("ppo.gamma", self.gamma, 0, 1)
+        _within("ppo.gae_lambda", self.gae_lambda, 0, 1)
+        _between("ppo.clip_epsilon", self.clip_epsilon, 0, 1)
+        _between("ppo.clip_epsilon_final", self.clip_epsilon_final, 0, 1)
+        _at_least("ppo.epochs", self.epochs, 1)
+        _at_least("ppo.minibatch_size", self.minibatch_size, 1)
+        _at_least("ppo.entropy_coef", self.entropy_coef, 0)
+        _at_least("ppo.entropy_coef_final", self.entropy_coef_final, 0)
+        _at_least("ppo.value_coef", self.value_coef, 0)
+        _above("ppo.huber_delta", self.huber_delta, 0)
+        _above("ppo.max_grad_norm", self.max_grad_norm, 0)
+        _above("ppo.target_kl", self.target_kl, 0)
+        _above("ppo.max_kl", self.max_kl, 0)
+
+
+@dataclass
+class CollectConfig:
+    """Collecting experience."""
+
+    rounds: int = 64
+    """Rounds (environment steps) in a batch; a batch holds rounds x agents decisions."""
+
+    def __post_init__(self) -> None:
+        _at_least("collect.rounds", self.rounds, 1)
+
+
+@dataclass
+class LogConfig:
+    """Metrics and progress."""
+
+    backends: list[LogBackend] = field(
+        default_factory=lambda: [LogBackend.csv, LogBackend.tensorboard]
+    )
+    """Any of csv, tensorboard, wandb, mlflow; metrics.csv is always written."""
+    project: str = "mappo-unity"
+    """Project (wandb) or experiment (mlflow) that the run is filed under."""
+    return_window: int = 100
+    """Finished episodes over which return_mean and its like are taken."""
+    progress: bool = True
+    """Show a live progress line on a terminal, and plain lines elsewhere."""
+
+    def __post_init__(self) -> None:
+        _at_least("log.return_window", self.return_window, 1)
+
+
+@dataclass
+class Config:
+    """Options of a run."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    """The environment."""
+    model: ModelConfig = field(default_factory=ModelConfig)
+    """The actor's and the critic's networks."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """The learner."""
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    """Collecting experience."""
+    log: LogConfig = field(default_factory=LogConfig)
+    """Metrics and progress."""
+    seed: int = 0
+    """Seed of the environment, the networks and the sampling."""
+    max_steps: int = 1_000_000
+    """Agent decisions after which the run ends."""
+    checkpoint_interval: int = 100_000
+    """Agent decisions between two checkpoints."""
+    keep_checkpoints: int = 5
+    """Newest checkpoints that are kept, besides the best one."""
+    device: str = "cpu"
+    """Device of the networks: cpu, cuda or cuda:N."""
+    num_threads: int = 1
+    """Threads of torch; small networks want one."""
+    resume: Optional[str] = None
+    """Run folder or checkpoint to continue."""
+    stop_at_return: Optional[float] = None
+    """End the run when return_mean over a full window reaches this."""
+    output_dir: str = "outputs"
+    """Folder under which run folders are made."""
+
+    def __post_init__(self) -> None:
+        _within("seed", self.seed, 0, 2**31 - 1)
+        _at_least("max_steps", self.max_steps, 1)
+        _at_least("checkpoint_interval", self.checkpoint_interval, 1)
+        _at_least("keep_checkpoints", self.keep_checkpoints, 1)
+        _at_least("num_threads", self.num_threads, 1)
+        kind, _, index = self.device.partition(":")
+        if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
+            raise ConfigError(f"device={self.device!r} must be one of cpu, cuda, cuda:N")
+
+
+def _rule(option: str, value: float | None, holds: bool, rule: str) -> None:
+    if value is not None and not (math.isfinite(value) and holds):
+        raise ConfigError(f"{option}={value} is out of range: {option} {rule}")
+
+
+def _at_least(option: str, value: float | None, low: float) -> None:
+    _rule(option, value, value is None or value >= low, f"must be >= {low}")
+
+
+def _above(option: str, value: float | None, low: float) -> None:
+    _rule(option, value, value is None or value > low, f"must be > {low}")
+
+
+def _within(option: str, value: float, low: float, high: float) -> None:
+    _rule(option, value, low <= value <= high, f"must be from {low} to {high}")
+
+
+def _between(option: str, value: float, low: float, high: float) -> None:
+    _rule(option, value, low < value < high, f"must be between {low} and {high}, exclusive")

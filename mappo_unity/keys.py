@@ -1,0 +1,40 @@
+"""TensorDict keys and the legend of dimensions, in one place.
+
+Legend (shape suffixes of tensors everywhere in the package):
+
+    E  environment copies        T  rounds (one round = one call of ``UnityEnv.step``)
+    S  sides of one policy name  G  teams of a side
+    A  agents of a team          O  features of the observation
+    K  discrete branches         C  continuous actions
+
+A policy name ("3DBall", "SoccerTwos") is the first key; below it stand the entries named here.
+An entry of a batch has shape ``[T, G, A, ...]`` for a policy with one side and ``[T, S, G, A, ...]``
+for a policy with several.
+"""
+
+OBS = "observation"  # float32 [..., A, O]: vector sensors, concatenated in the order of the specs
+SENSOR = "obs_{}"  # float32 [..., A, *sensor shape]: sensor i before concatenation
+ACTION = "action"  # see models.ActionLayout
+LOG_PROB = "action_log_prob"  # float32 [..., A]
+MASK = "action_mask"  # bool [..., A, sum of branches]: True = allowed (Unity's sense, turned round)
+ACTING = "acting"  # bool [..., A, 1]: the agent was asked for an action in this round
+PRESENT = "present"  # bool [..., A, 1]: an agent holds the slot
+REWARD = "reward"  # float32 [..., A, 1]: individual reward that arrived in this round
+GROUP_REWARD = "group_reward"  # float32 [..., A, 1]: reward of the agent's team, likewise
+DONE = "done"  # bool [..., A, 1]: terminated or truncated
+TERMINATED = "terminated"  # bool [..., A, 1]: a real end
+TRUNCATED = "truncated"  # bool [..., A, 1]: a time limit ("interrupted" in ML-Agents)
+VALUE = "state_value"  # float32 [..., A, 1]: in the critic's (normalised) space
+ADVANTAGE = "advantage"  # float32 [..., A, 1]
+VALUE_TARGET = "value_target"  # float32 [..., A, 1]: in the critic's (normalised) space
+
+
+def policy_name(behavior_name: str) -> str:
+    """Return the policy of a behavior: ``"SoccerTwos?team=1"`` -> ``"SoccerTwos"``."""
+    return behavior_name.split("?", 1)[0]
+
+
+def team_id(behavior_name: str) -> int:
+    """Return the side of a behavior: ``"SoccerTwos?team=1"`` -> 1; 0 where none is given."""
+    _, _, query = behavior_name.partition("?team=")
+    return int(query) if query else 0
