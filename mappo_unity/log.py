@@ -1,0 +1,147 @@
+"""Metrics out of a run: ``metrics.csv`` always, TorchRL's loggers by choice, progress on the terminal.
+
+In: one row of numbers an iteration, and the run's folder. Out: files there, services, a progress line.
+A resumed run continues its files without repeated rows. Knows nothing of how the numbers came about.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import numbers
+import os
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from mappo_unity.config import ConfigError, LogBackend, LogConfig
+from mappo_unity.metrics_file import STEP, MetricsFile, keep_until, read_metrics
+from mappo_unity.progress import Progress
+
+if TYPE_CHECKING:
+    from torchrl.record.loggers.common import Logger
+
+__all__ = ["RunLog", "check_backends", "read_metrics"]
+
+
+def check_backends(cfg: LogConfig) -> None:
+    """Raise ConfigError where a logger's package is not installed; quick, imports nothing."""
+    for backend in (LogBackend.tensorboard, LogBackend.wandb, LogBackend.mlflow):
+        if backend in cfg.backends and importlib.util.find_spec(backend.name) is None:
+            raise ConfigError(
+                f"log.backends has {backend.name}, but the package {backend.name} is not installed: "
+                f"pip install 'mappo-unity[{backend.name}]', or leave it out (log.backends=[tensorboard]; "
+                f"choices: {', '.join(choice.name for choice in LogBackend)})"
+            )
+
+
+class RunLog:
+    """Take a run's metrics, one row an iteration; also a context manager that closes itself.
+
+    `folder` is the run's. With `resume_steps` given (agent decisions at the checkpoint that is continued)
+    what the run wrote after that is removed first, from ``metrics.csv``, TensorBoard events and TorchRL's
+    CSV files; W&B and MLflow keep it: W&B continues the same run, MLflow starts another one. Log a row
+    before the checkpoint of its iteration is written, and no row is lost either. `console`: where progress
+    and messages go, standard output by default.
+
+    Raises ConfigError for a logger that is not installed, and for a new run in a folder that has metrics.
+    """
+
+    def __init__(
+        self,
+        cfg: LogConfig,
+        folder: Path,
+        max_steps: int,
+        resume_steps: int | None = None,
+        console: Console | None = None,
+    ) -> None:
+        check_backends(cfg)
+        metrics = folder / "metrics.csv"
+        if resume_steps is not None:
+            keep_until(folder, resume_steps)
+        elif metrics.exists():
+            raise ConfigError(
+                f"{metrics} exists already; continue that run (resume={folder}) or take another folder"
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        self._console = console or Console()
+        self._progress = Progress(self._console, max_steps) if cfg.progress else None
+        self._metrics = MetricsFile(metrics)
+        self._loggers = [_make_logger(backend, cfg, folder) for backend in dict.fromkeys(cfg.backends)]
+
+    def log(self, row: Mapping[str, Any]) -> None:
+        """Record a row: numbers by name, with ``agent_steps``; NaN (no episode yet) goes to the CSV only.
+
+        When this returns the row outlives a kill of the process, in ``metrics.csv`` and in the event files.
+        """
+        numbers_by_name = {name: _plain(value) for name, value in row.items()}
+        self._metrics.append(numbers_by_name)
+        step = int(numbers_by_name[STEP])
+        curves = {name: x for name, x in numbers_by_name.items() if name != STEP and not math.isnan(x)}
+        for logger in self._loggers:
+            logger.log_metrics(curves, step=step)
+            logger.flush()
+        if self._progress is not None:
+            self._progress.update(numbers_by_name)
+
+    def message(self, text: str) -> None:
+        """Print a line above the progress line."""
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def close(self) -> None:
+        """Finish the progress line and close files and loggers; again: nothing."""
+        if self._progress is not None:
+            self._progress.close()
+            self._progress = None
+        self._metrics.close()
+        while self._loggers:
+            _close_logger(self._loggers.pop())
+
+    def __enter__(self) -> RunLog:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _plain(value: Any) -> int | float:
+    return int(value) if isinstance(value, numbers.Integral) else float(value)
+
+
+def _make_logger(backend: LogBackend, cfg: LogConfig, folder: Path) -> Logger:
+    from torchrl.record import loggers
+
+    name = "/".join(folder.resolve().parts[-2:])
+    if backend is LogBackend.csv:
+        return loggers.CSVLogger("csv", log_dir=str(folder))
+    if backend is LogBackend.tensorboard:
+        return loggers.TensorboardLogger("tensorboard", log_dir=str(folder))
+    if backend is LogBackend.wandb:
+        return loggers.WandbLogger(
+            name, save_dir=str(folder), id=_wandb_id(folder / "wandb_id"), project=cfg.project
+        )
+    uri = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{folder.resolve() / 'mlflow.db'}"
+    return loggers.MLFlowLogger(cfg.project, tracking_uri=uri, tags={"run": name})
+
+
+def _wandb_id(path: Path) -> str:
+    """Return the id under which W&B knows the run of this folder: made once, so that resuming finds it."""
+    if not path.exists():
+        path.write_text(uuid.uuid4().hex)
+    return path.read_text().strip()
+
+
+def _close_logger(logger: Logger) -> None:
+    from torchrl.record.loggers import MLFlowLogger
+
+    if isinstance(logger, MLFlowLogger):  # its run would stay active and refuse the next one of a sweep
+        import mlflow
+
+        mlflow.end_run()
+    logger.close()
