@@ -1,0 +1,115 @@
+"""Pure maths of the learner: the masked advantage recursion, masked statistics, schedules.
+
+In and out: tensors. Knows nothing of TensorDict keys, environments or networks.
+Legend of suffixes: see `keys`; ``_T`` stands for ``[T, ...]`` with any trailing slot dimensions.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mappo_unity.config import Schedule
+
+
+class Advantage(NamedTuple):
+    """Result of `masked_gae`; every tensor is ``[T, ...]``."""
+
+    advantage: Tensor  # float32, 0 where not known
+    target: Tensor  # float32, value targets (advantage + value), 0 where not known
+    known: Tensor  # bool: rows with a decision whose outcome has arrived
+
+
+def masked_gae(
+    reward_T: Tensor,
+    value_T: Tensor,
+    end_value_T: Tensor,
+    final_value: Tensor,
+    valued_T: Tensor,
+    final_valued: Tensor,
+    terminated_T: Tensor,
+    truncated_T: Tensor,
+    *,
+    gamma: float,
+    gae_lambda: float,
+) -> Advantage:
+    """Estimate advantages of slots that do not act in every round.
+
+    For the k-th row of a slot in which it has a value (a decision was asked of it), with R_k the sum
+    of all rewards that arrived from that row up to the next such row or the end,
+
+        delta_k = R_k + gamma * V_next - V_k
+        A_k     = delta_k + gamma * gae_lambda * A_next
+
+    where V_next, A_next belong to the next valued row; at a real end both are 0, at an interruption
+    V_next is the value of the terminal observation and A_next is 0. Rounds in which the slot was not
+    asked pass both on unchanged. A decision whose outcome has not arrived when the batch ends has no
+    advantage (``known`` is False); the rows before it bootstrap from its value. With every slot
+    valued in every round this is GAE (Schulman et al., arXiv 1506.02438, eq. 16).
+
+    Args:
+        reward_T: float ``[T, ...]``, reward that arrived in a round.
+        value_T: float ``[T, ...]``, value of the row's observation (read where valued).
+        end_value_T: float ``[T, ...]``, value of the terminal observation (read where truncated).
+        final_value, final_valued: ``[...]``, value and mask of the row after the last.
+        valued_T, terminated_T, truncated_T: bool ``[T, ...]``.
+
+    Returns:
+        `Advantage`.
+    """
+    advantage_T = torch.zeros_like(value_T)
+    known_T = torch.zeros_like(valued_T)
+    zero = torch.zeros_like(final_value)
+    next_value, next_advantage, waiting = final_value, zero, zero
+    known = final_valued.clone()
+    ended_T = terminated_T | truncated_T
+    boot_T = torch.where(truncated_T, end_value_T, 0.0)
+    for t in range(len(reward_T) - 1, -1, -1):
+        ended, valued = ended_T[t], valued_T[t]
+        waiting = reward_T[t] + torch.where(ended, zero, waiting)
+        next_value = torch.where(ended, boot_T[t], next_value)
+        next_advantage = torch.where(ended, zero, next_advantage)
+        known = known | ended
+        row = waiting + gamma * next_value - value_T[t] + gamma * gae_lambda * next_advantage
+        known_T[t] = valued & known
+        advantage_T[t] = torch.where(known_T[t], row, zero)
+        next_advantage = torch.where(valued, advantage_T[t], next_advantage)
+        next_value = torch.where(valued, value_T[t], next_value)
+        waiting = torch.where(valued, zero, waiting)
+        known = known | valued
+    target_T = torch.where(known_T, advantage_T + value_T, 0.0)
+    return Advantage(advantage_T, target_T, known_T)
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean of ``values`` where ``mask`` holds (0 if nowhere), a scalar."""
+    weight = mask.to(torch.get_default_dtype())
+    return (values * weight).sum() / weight.sum().clamp_min(1.0)
+
+
+def normalize(values: Tensor, mask: Tensor, eps: float = 1e-5) -> Tensor:
+    """Return ``(values - mean) / (std + eps)`` with statistics over ``mask``; 0 elsewhere."""
+    mean = masked_mean(values, mask)
+    std = masked_mean((values - mean) ** 2, mask).sqrt()
+    return torch.where(mask, (values - mean) / (std + eps), 0.0)
+
+
+def explained_variance(value: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """Return ``1 - Var[target - value] / Var[target]`` over ``mask``; nan if the targets are equal."""
+    error = target - value
+    error_var = masked_mean((error - masked_mean(error, mask)) ** 2, mask)
+    target_var = masked_mean((target - masked_mean(target, mask)) ** 2, mask)
+    return torch.where(target_var > 0, 1 - error_var / target_var, torch.nan)
+
+
+def scheduled(schedule: Schedule, start: float, final: float, progress: float) -> float:
+    """Return where a quantity stands after ``progress`` (0 to 1) of a run."""
+    progress = min(max(progress, 0.0), 1.0)
+    if schedule is Schedule.constant:
+        return start
+    if schedule is Schedule.cosine:
+        progress = 0.5 - 0.5 * math.cos(math.pi * progress)
+    return start + (final - start) * progress

@@ -1,0 +1,172 @@
+"""Checkpoints: written whole or not at all, read without running code.
+
+In: nested dicts of tensors, numpy arrays and plain values. Out: ``.pt`` files that plain
+``torch.load(weights_only=True)`` opens. Knows nothing of what the entries mean.
+
+A file is written beside its place, synced and renamed, so that a kill or a full disk leaves the
+previous one. It is a zip archive; its checksums are verified before anything is read, and only
+tensors and plain values are ever unpickled.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mappo_unity.config import ConfigError
+
+FORMAT = 1
+FOLDER = "checkpoints"
+BEST = "best.pt"
+_NAME = "step_{:012d}.pt"
+_PATTERN = re.compile(r"step_(\d{12})\.pt")
+
+
+class CheckpointError(ConfigError):
+    """A checkpoint cannot be written, read or used; the message says which and why."""
+
+
+def save(path: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint atomically.
+
+    Raises:
+        CheckpointError: the disk is full or the folder cannot be written; a previous file stays.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "wb") as file:
+            torch.save(_to_tensors({"format": FORMAT} | state), file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except (OSError, RuntimeError) as error:
+        temporary.unlink(missing_ok=True)
+        raise CheckpointError(
+            f"checkpoint {path} could not be written: {error}; the checkpoints before it stay as they are. "
+            "Free some space or choose another output_dir, then continue with resume=" + str(path.parent.parent)
+        ) from error
+
+
+def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, best: bool) -> Path:
+    """Write a run's checkpoint, make it the best one if it is, and drop all but the newest ``keep``."""
+    path = folder / FOLDER / _NAME.format(agent_steps)
+    save(path, state)
+    if best:
+        link = path.with_name(f".{BEST}.{os.getpid()}.tmp")
+        link.unlink(missing_ok=True)
+        try:
+            os.link(path, link)
+        except OSError:  # a file system without hard links
+            save(path.with_name(BEST), state)
+        else:
+            os.replace(link, path.with_name(BEST))
+    for old in checkpoints_in(folder)[:-keep]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def checkpoints_in(folder: Path) -> list[Path]:
+    """Return a run's numbered checkpoints, oldest first."""
+    return sorted(p for p in (folder / FOLDER).glob("step_*.pt") if _PATTERN.fullmatch(p.name))
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read a checkpoint.
+
+    Raises:
+        CheckpointError: it is missing, damaged, not ours, or holds more than tensors and plain values.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint {path} does not exist")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise CheckpointError(f"checkpoint {path} is damaged: the checksum of its part {damaged!r} is wrong")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except CheckpointError:
+        raise
+    except Exception as error:  # zipfile, pickle and torch raise many kinds for damaged or hostile files
+        reason = str(error).strip().split("\n")[0][:200] or type(error).__name__
+        raise CheckpointError(f"checkpoint {path} is damaged or no checkpoint of mappo-unity: {reason}") from error
+    if not isinstance(state, dict) or state.get("format") != FORMAT:
+        raise CheckpointError(f"checkpoint {path} has another format than this version reads ({FORMAT})")
+    return state
+
+
+def newest_good(where: Path) -> tuple[Path, list[str]]:
+    """Return the checkpoint to continue from: the file itself, or a folder's newest good one.
+
+    Returns:
+        The path, and a line for each damaged file that was passed over.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    if where.is_file():
+        candidates, folder = [where], where.parent.parent
+        candidates += [p for p in reversed(checkpoints_in(folder)) if p.name < where.name]
+    elif where.is_dir():
+        candidates = list(reversed(checkpoints_in(where)))
+    else:
+        raise CheckpointError(f"{where} does not exist: give a run folder or a checkpoint file")
+    if not candidates:
+        raise CheckpointError(f"{where} holds no checkpoint ({FOLDER}/step_*.pt): nothing to continue from")
+    warnings: list[str] = []
+    for path in candidates:
+        try:
+            load(path)
+        except CheckpointError as error:
+            warnings.append(str(error))
+        else:
+            return path, warnings
+    raise CheckpointError(f"{where} holds no good checkpoint:\n  " + "\n  ".join(warnings))
+
+
+def _to_tensors(value: Any) -> Any:
+    """Turn numpy arrays and scalars into what weights_only loading allows."""
+    if isinstance(value, dict):
+        return {key: _to_tensors(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_to_tensors(entry) for entry in value]
+    if isinstance(value, np.ndarray):
+        return _array_to_tensor(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    return value
+
+
+def _array_to_tensor(array: np.ndarray) -> Any:
+    if array.dtype in (np.uint16, np.uint32, np.uint64):
+        return {"__array__": str(array.dtype), "data": torch.from_numpy(array.view(f"i{array.itemsize}").copy())}
+    return torch.from_numpy(np.ascontiguousarray(array).copy())
+
+
+def to_arrays(value: Any) -> Any:
+    """Turn the tensors of a loaded state back into numpy arrays (for scenes and adapters)."""
+    if isinstance(value, dict):
+        if "__array__" in value:
+            return value["data"].numpy().view(value["__array__"])
+        return {key: to_arrays(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [to_arrays(entry) for entry in value]
+    return value.numpy() if isinstance(value, torch.Tensor) else value
+
+
+def _sync_folder(folder: Path) -> None:
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:  # not possible on every platform; the rename itself is atomic
+        return
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,26 @@
+"""The collector: policies and an environment in, batches ``[T, ...]`` out.
+
+In: a `TransformedEnv`, the joint policy, `CollectConfig`. Out: a TorchRL `Collector`.
+"""
+
+from __future__ import annotations
+
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, ExplorationType
+
+from mappo_unity.config import CollectConfig
+from mappo_unity.models import JointPolicy
+
+
+def make_collector(env: EnvBase, policy: JointPolicy, cfg: CollectConfig) -> Collector:
+    """Build a collector of endless batches of ``cfg.rounds`` rounds."""
+    return Collector(
+        env,
+        policy,
+        frames_per_batch=cfg.rounds,
+        total_frames=-1,
+        exploration_type=ExplorationType.RANDOM,
+        track_traj_ids=False,
+        use_buffers=False,
+        trust_policy=True,
+    )

@@ -1,0 +1,96 @@
+"""Finished episodes and batches to scalars.
+
+In: episodes as `UnityEnv.pop_episodes` returns them, batches. Out: dicts of floats. Logs nothing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from tensordict import TensorDictBase
+
+from mappo_unity import keys
+from mappo_unity.rounds import Episode
+
+
+class EpisodeWindow:
+    """The newest finished episodes of every behavior."""
+
+    def __init__(self, size: int, behaviors: list[str]) -> None:
+        self.size = size
+        self.total = 0
+        self.recent: dict[str, deque[tuple[float, float, int]]] = {b: deque(maxlen=size) for b in behaviors}
+
+    def add(self, episodes: dict[str, list[Episode]]) -> int:
+        """Take finished episodes in; return how many there were."""
+        count = 0
+        for behavior, finished in episodes.items():
+            for episode in finished:
+                if episode.length:
+                    row = (episode.individual_return, episode.group_return, episode.length)
+                    self.recent[behavior].append(row)
+                    count += 1
+        self.total += count
+        return count
+
+    @property
+    def full(self) -> bool:
+        """Whether every behavior has as many episodes as the window holds."""
+        return all(len(rows) == self.size for rows in self.recent.values())
+
+    def summary(self) -> dict[str, float]:
+        """Return means over the window, over all behaviors and, if several, for each of them.
+
+        A return is the individual and the group reward of an agent's episode.
+        """
+        everything = [row for rows in self.recent.values() for row in rows]
+        out = _summary("", everything)
+        if len(self.recent) > 1:
+            for behavior, rows in self.recent.items():
+                out |= _summary(f"{behavior}/", list(rows))
+        return out
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that continuing needs."""
+        return {"total": self.total, "recent": {b: [list(r) for r in rows] for b, rows in self.recent.items()}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` returned."""
+        self.total = int(state["total"])
+        for behavior, rows in state["recent"].items():
+            self.recent[behavior] = deque(((r[0], r[1], int(r[2])) for r in rows), maxlen=self.size)
+
+
+def _summary(prefix: str, rows: list[tuple[float, float, int]]) -> dict[str, float]:
+    if not rows:
+        names = ("return_mean", "return_std", "group_return_mean", "episode_length_mean")
+        return {f"{prefix}{name}": float("nan") for name in names}
+    individual, group, length = (np.array(column, float) for column in zip(*rows))
+    returns = individual + group
+    return {
+        f"{prefix}return_mean": float(returns.mean()),
+        f"{prefix}return_std": float(returns.std()),
+        f"{prefix}group_return_mean": float(group.mean()),
+        f"{prefix}episode_length_mean": float(length.mean()),
+    }
+
+
+def count_decisions(batch: TensorDictBase, policies: list[str]) -> int:
+    """Return how many agent decisions a batch holds (ML-Agents' steps)."""
+    return int(sum(batch.get((name, keys.ACTING)).sum() for name in policies))
+
+
+def by_policy(metrics: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Return learning metrics of all policies: plain names for one, ``Name/metric`` for several.
+
+    With several the plain names hold the mean, so that every run has the same first columns.
+    """
+    if len(metrics) == 1:
+        return dict(next(iter(metrics.values())))
+    names = list(dict.fromkeys(name for row in metrics.values() for name in row))
+    out = {name: float(np.mean([row[name] for row in metrics.values() if name in row])) for name in names}
+    for policy, row in metrics.items():
+        out |= {f"{policy}/{name}": value for name, value in row.items()}
+    return out

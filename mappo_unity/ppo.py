@@ -1,0 +1,250 @@
+"""PPO for one policy name: a batch in, better networks and metrics out.
+
+In: a batch ``[T, ..., A]`` of one policy name, networks, `PPOConfig`. Out: metrics as a dict. Must
+not know environments, collectors, files or other policies.
+
+`PolicyLearner.learn` reads top to bottom: values, advantages, rows, minibatches, statistics.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data.replay_buffers import SamplerWithoutReplacement
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import ClipPPOLoss
+
+from mappo_unity import keys
+from mappo_unity.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
+from mappo_unity.config import Optimizer, PPOConfig, ValueLoss
+from mappo_unity.models import RunningNorm
+from mappo_unity.value_norm import ValueNorm
+
+LEARNS = "learns"  # bool [rows, A, 1]: the slot acted and the outcome is known
+
+
+class MaskedClipPPOLoss(ClipPPOLoss):
+    """ClipPPOLoss over the slots that acted, with a Huber threshold of choice.
+
+    TorchRL's smooth_l1 has its knee at 1: dividing prediction and target by delta and multiplying
+    the loss by delta**2 gives the Huber loss with its knee at delta.
+    """
+
+    def __init__(self, actor: ProbabilisticActor, critic: TensorDictModule, cfg: PPOConfig) -> None:
+        self.huber_delta = cfg.huber_delta if cfg.value_loss is ValueLoss.huber else 1.0
+        super().__init__(
+            actor,
+            critic,
+            clip_epsilon=cfg.clip_epsilon,
+            entropy_coeff=cfg.entropy_coef,
+            critic_coeff=cfg.value_coef * self.huber_delta**2,
+            loss_critic_type="smooth_l1" if cfg.value_loss is ValueLoss.huber else "l2",
+            normalize_advantage=False,
+            clip_value=cfg.clip_epsilon / self.huber_delta if cfg.clip_value else None,
+            functional=False,
+        )
+        self.log_explained_variance = False
+        self.loss_mask_key = LEARNS
+        self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
+        self.log_ratio = torch.zeros(())
+
+    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> Any:
+        out = super()._log_weight(tensordict, adv_shape)
+        self.log_ratio = out[0].detach()
+        return out
+
+    def _critic_loss_inputs(self, target_return: Tensor, state_value: Tensor, old_state_value: Tensor | None) -> Any:
+        delta = self.huber_delta
+        old = None if old_state_value is None else old_state_value / delta
+        return target_return / delta, state_value / delta, old
+
+
+class PolicyLearner:
+    """Everything that learns for one policy name.
+
+    Args:
+        actor, critic: see `models`.
+        cfg: the learner's options.
+        max_rows: team rows of the largest batch.
+        team_size: slots of a row.
+    """
+
+    def __init__(
+        self, actor: ProbabilisticActor, critic: TensorDictModule, cfg: PPOConfig, max_rows: int, team_size: int
+    ) -> None:
+        self.actor, self.critic, self.cfg = actor, critic, cfg
+        self.loss = MaskedClipPPOLoss(actor, critic, cfg)
+        self.params = [*actor.parameters(), *critic.parameters()]
+        self.optimizer = make_optimizer(self.params, cfg)
+        self.value_norm = ValueNorm(cfg.value_norm_beta, cfg.normalize_values)
+        self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
+        self.rollbacks = 0
+        self.buffer = ReplayBuffer(
+            storage=LazyTensorStorage(max_rows),
+            sampler=SamplerWithoutReplacement(),
+            batch_size=max(1, cfg.minibatch_size // team_size),
+        )
+
+    def learn(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        """Improve the networks by one batch.
+
+        Args:
+            batch: ``[T, ..., A]`` entries of this policy name, as collected.
+            progress: share of the run that is over, 0 to 1, for the schedules.
+
+        Returns:
+            Metrics.
+        """
+        settings = self._set_schedules(progress)
+        rows, metrics = self._prepare(batch)
+        metrics |= self._update(rows) if len(rows) else {}
+        self._update_norms(batch)
+        return metrics | settings
+
+    def _set_schedules(self, progress: float) -> dict[str, float]:
+        cfg = self.cfg
+        lr = scheduled(cfg.lr_schedule, cfg.lr, cfg.lr_final, progress)
+        clip = scheduled(cfg.clip_schedule, cfg.clip_epsilon, cfg.clip_epsilon_final, progress)
+        entropy = scheduled(cfg.entropy_schedule, cfg.entropy_coef, cfg.entropy_coef_final, progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = lr
+        self.loss.clip_epsilon.fill_(clip)
+        self.loss.entropy_coeff.fill_(entropy)
+        return {"lr": lr, "clip_epsilon": clip, "entropy_coef": entropy}
+
+    @torch.no_grad()
+    def _prepare(self, batch: TensorDictBase) -> tuple[TensorDictBase, dict[str, float]]:
+        """Add advantages and targets; return the team rows ``[R, A]`` in which anybody learns."""
+        following = batch.get("next")
+        acting, truncated = batch.get(keys.ACTING), following.get(keys.TRUNCATED)
+        value = self.value_norm.denormalize(self.critic(batch.select(keys.OBS)).get(keys.VALUE))
+        estimate = masked_gae(
+            following.get(keys.REWARD) + following.get(keys.GROUP_REWARD),
+            value,
+            self._end_values(following, truncated),
+            self.value_norm.denormalize(self.critic(following[-1].select(keys.OBS)).get(keys.VALUE)),
+            acting,
+            following.get(keys.ACTING)[-1],
+            following.get(keys.TERMINATED),
+            truncated,
+            gamma=self.cfg.gamma,
+            gae_lambda=self.cfg.gae_lambda,
+        )
+        learns = estimate.known
+        metrics = {
+            "explained_variance": float(explained_variance(value, estimate.target, learns)),
+            "value_mean": float(masked_mean(value, learns)),
+        }
+        self.value_norm.update(estimate.target[learns])
+        advantage = normalize(estimate.advantage, learns) if self.cfg.normalize_advantages else estimate.advantage
+        entries = {
+            key: batch.get(key) for key in (keys.OBS, keys.ACTION, keys.LOG_PROB, keys.MASK) if key in batch.keys()
+        }
+        entries |= {keys.ADVANTAGE: advantage, keys.VALUE_TARGET: self.value_norm.normalize(estimate.target)}
+        entries |= {LEARNS: learns, keys.VALUE: self.value_norm.normalize(value)}
+        rows = TensorDict(entries, batch.batch_size).flatten(0, -2)
+        used = learns.flatten(0, -3).any(-2).squeeze(-1)
+        return (rows if bool(used.all()) else rows[used]), metrics
+
+    def _end_values(self, following: TensorDictBase, truncated: Tensor) -> Tensor:
+        """Values of terminal observations of cut episodes, 0 elsewhere."""
+        out = torch.zeros(truncated.shape)
+        where = truncated.flatten(0, -3).any(-2).squeeze(-1)
+        if where.any():
+            rows = following.select(keys.OBS).flatten(0, -2)[where]
+            out.flatten(0, -3)[where] = self.value_norm.denormalize(self.critic(rows).get(keys.VALUE))
+        return out
+
+    def _update(self, rows: TensorDictBase) -> dict[str, float]:
+        """Run the epochs; take everything back if a number is not finite or the KL explodes."""
+        before = copy.deepcopy(self._trainable_state())
+        self.buffer.empty()
+        self.buffer.extend(rows)
+        sums: dict[str, Tensor] = {}
+        steps, kl_epoch, stopped = 0, 0.0, False
+        for _ in range(self.cfg.epochs):
+            kls = []
+            for minibatch in self.buffer:
+                terms = self._step(minibatch)
+                sums = {k: v + sums.get(k, 0.0) for k, v in terms.items()}
+                kls.append(terms["kl"])
+                steps += 1
+            kl_epoch = float(torch.stack(kls).mean())
+            if not math.isfinite(kl_epoch) or kl_epoch > self.cfg.max_kl:
+                break
+            if self.cfg.target_kl is not None and kl_epoch > self.cfg.target_kl:
+                stopped = True
+                break
+        metrics = {name: float(value) / steps for name, value in sums.items()}
+        healthy = all(math.isfinite(v) for v in metrics.values()) and self._weights_finite()
+        if not healthy or kl_epoch > self.cfg.max_kl:
+            self._load_trainable(before)
+            self.rollbacks += 1
+        rolled = {"rolled_back": float(not healthy or kl_epoch > self.cfg.max_kl)}
+        return metrics | rolled | {"kl_last": kl_epoch, "kl_stopped": float(stopped), "rollbacks": float(self.rollbacks)}
+
+    def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        losses = self.loss(minibatch)
+        total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        self.optimizer.zero_grad()
+        total.backward()
+        grad_norm = nn.utils.clip_grad_norm_(self.params, self.cfg.max_grad_norm, foreach=True)
+        self.optimizer.step()
+        with torch.no_grad():
+            mask, log_ratio = minibatch.get(LEARNS), self.loss.log_ratio
+            # k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative
+            kl = masked_mean(torch.where(mask, log_ratio.exp() - 1 - log_ratio, 0.0), mask)
+            clipped = masked_mean((log_ratio.exp() - 1).abs() > self.loss.clip_epsilon, mask)
+        return {
+            "policy_loss": losses["loss_objective"].detach(),
+            "value_loss": losses["loss_critic"].detach(),
+            "entropy": losses["entropy"].detach(),
+            "kl": kl,
+            "clip_fraction": clipped,
+            "grad_norm": grad_norm.detach(),
+        }
+
+    @torch.no_grad()
+    def _update_norms(self, batch: TensorDictBase) -> None:
+        """Take the batch's observations into the normalisers, after the update that must not see it."""
+        rows = batch.get(keys.OBS)[batch.get(keys.ACTING).squeeze(-1)]
+        for norm in self.norms:
+            norm.update(rows)
+
+    def _weights_finite(self) -> bool:
+        return all(bool(torch.isfinite(p).all()) for p in self.params)
+
+    def _trainable_state(self) -> dict[str, Any]:
+        return {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+        }
+
+    def _load_trainable(self, state: dict[str, Any]) -> None:
+        self.actor.load_state_dict(state["actor"])
+        self.critic.load_state_dict(state["critic"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that continuing needs."""
+        return self._trainable_state() | {"value_norm": self.value_norm.state_dict(), "rollbacks": self.rollbacks}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` returned."""
+        self._load_trainable(state)
+        self.value_norm.load_state_dict(state["value_norm"])
+        self.rollbacks = int(state["rollbacks"])
+
+
+def make_optimizer(params: list[nn.Parameter], cfg: PPOConfig) -> torch.optim.Optimizer:
+    """Build the optimizer; its fused form makes one pass over all parameters."""
+    kind = torch.optim.AdamW if cfg.optimizer is Optimizer.adamw else torch.optim.Adam
+    return kind(params, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=1e-5, fused=True)

@@ -1,0 +1,115 @@
+"""Slots of one behavior: which row of the batch holds which agent.
+
+In: agent ids and group ids as a BaseEnv reports them. Out: flat slot numbers ``team * A + member``.
+Agents of one group share a team; an agent without a group is a team of its own. A slot belongs to
+its agent until the agent has ended *and* somebody else needs the place, so an agent that goes on
+under its old id after a terminal step keeps its slot. Knows nothing of observations or actions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mappo_unity.config import ConfigError
+
+FREE = -(2**62)  # no agent id, no team key
+
+
+class SlotTable:
+    """Assign agents to ``num_teams x team_size`` slots (G x A)."""
+
+    def __init__(self, behavior: str, num_teams: int, team_size: int) -> None:
+        self.behavior = behavior
+        self.num_teams, self.team_size = num_teams, team_size
+        self.agent_id = np.full(num_teams * team_size, FREE, np.int64)
+        self.ended = np.ones(num_teams * team_size, bool)
+        self.team_key = np.full(num_teams, FREE, np.int64)
+        self._slot_of: dict[int, int] = {}
+        self._last_ids = np.zeros(0, np.int64)
+        self._last_slots = np.zeros(0, np.int64)
+
+    def assign(self, agent_ids: np.ndarray, group_ids: np.ndarray) -> np.ndarray:
+        """Return the slots of these agents, giving places to the new ones.
+
+        Args:
+            agent_ids: int ``[n]``; group_ids: int ``[n]``, 0 = alone.
+
+        Returns:
+            int64 ``[n]``, flat slots.
+
+        Raises:
+            ConfigError: no slot is left for a new agent or team.
+        """
+        if np.array_equal(agent_ids, self._last_ids):
+            return self._last_slots
+        slots = np.empty(len(agent_ids), np.int64)
+        for row, (agent, group) in enumerate(zip(agent_ids.tolist(), group_ids.tolist())):
+            slot = self._slot_of.get(agent)
+            slots[row] = self._place(agent, group) if slot is None else slot
+        self._last_ids, self._last_slots = agent_ids.astype(np.int64), slots
+        return slots
+
+    def lookup(self, agent_ids: np.ndarray) -> np.ndarray:
+        """Return the slots of these agents, -1 for those that hold none."""
+        return np.array([self._slot_of.get(agent, -1) for agent in agent_ids.tolist()], np.int64)
+
+    def agents_of(self, slots: np.ndarray) -> list[int]:
+        """Return the ids of the agents that hold these slots."""
+        return self.agent_id[slots].tolist()
+
+    def _place(self, agent: int, group: int) -> int:
+        key = group if group > 0 else -1 - agent
+        team = self._team(key, agent)
+        members = slice(team * self.team_size, (team + 1) * self.team_size)
+        empty = np.flatnonzero(self.agent_id[members] == FREE)
+        left = empty if len(empty) else np.flatnonzero(self.ended[members])
+        if not len(left):
+            raise ConfigError(
+                f"behavior {self.behavior!r}: agent {agent} is one more than the {self.team_size} slots of "
+                f"its team (group {group}); give room with env.max_team_size={self.team_size + 1} or more"
+            )
+        slot = team * self.team_size + int(left[0])
+        self._slot_of.pop(int(self.agent_id[slot]), None)
+        self._slot_of[agent] = slot
+        self.agent_id[slot] = agent
+        self.ended[slot] = False
+        self._last_ids = np.zeros(0, np.int64)
+        return slot
+
+    def _team(self, key: int, agent: int) -> int:
+        known = np.flatnonzero(self.team_key == key)
+        if len(known):
+            return int(known[0])
+        free = np.flatnonzero(self.team_key == FREE)
+        if not len(free):
+            ended = self.ended.reshape(self.num_teams, self.team_size).all(1)
+            free = np.flatnonzero(ended)
+        if not len(free):
+            raise ConfigError(
+                f"behavior {self.behavior!r}: agent {agent} begins one more team than the {self.num_teams} "
+                f"team slots; give room with env.max_teams={self.num_teams + 1} or more"
+            )
+        team = int(free[0])
+        members = slice(team * self.team_size, (team + 1) * self.team_size)
+        for old in self.agent_id[members].tolist():
+            self._slot_of.pop(old, None)
+        self.agent_id[members] = FREE
+        self.ended[members] = True
+        self.team_key[team] = key
+        return team
+
+    def get_state(self) -> dict:
+        """Return everything that `set_state` needs."""
+        return {
+            "agent_id": self.agent_id.copy(),
+            "ended": self.ended.copy(),
+            "team_key": self.team_key.copy(),
+        }
+
+    def set_state(self, state: dict) -> None:
+        """Go back to a state that `get_state` returned."""
+        self.agent_id = np.array(state["agent_id"], np.int64)
+        self.ended = np.array(state["ended"], bool)
+        self.team_key = np.array(state["team_key"], np.int64)
+        self._slot_of = {int(a): s for s, a in enumerate(self.agent_id.tolist()) if a != FREE}
+        self._last_ids = self._last_slots = np.zeros(0, np.int64)

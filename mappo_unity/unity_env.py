@@ -1,0 +1,273 @@
+"""UnityEnv: a BaseEnv as a TorchRL environment of batched slots.
+
+In: any `mlagents_envs.base_env.BaseEnv`. Out: TensorDicts with one entry a behavior, ``[G, A, ...]``
+(see `keys`). This module alone knows DecisionSteps and TerminalSteps (with `rounds` and `slots`);
+it must not know what runs below the BaseEnv, nor what learns above.
+
+One ``step`` is one round: hand actions to the agents that asked, then step the BaseEnv until
+somebody asks again. Agents that end go on by themselves (auto-reset in the scene), so a partial
+reset only hands out the first observation of the next episode; the scene itself is reset by a full
+``reset()`` alone, and a full reset right after another does nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Callable
+
+import numpy as np
+import torch
+from mlagents_envs.base_env import BaseEnv
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, MultiCategorical, Unbounded
+from torchrl.envs import EnvBase
+
+from mappo_unity import keys
+from mappo_unity.config import ConfigError
+from mappo_unity.rounds import BehaviorRounds, Episode
+from mappo_unity.slots import SlotTable
+
+MAX_SILENT_STEPS = 100_000  # BaseEnv steps in which nobody asks before that is called an error
+
+
+class UnityEnv(EnvBase):
+    """Play a BaseEnv in rounds of batched slots.
+
+    Args:
+        make_env: called with a seed, returns the BaseEnv. `set_seed` closes it and calls again.
+        seed: its first seed.
+        action_limit: continuous actions are clipped to +-limit and divided by it (ML-Agents
+            policies use 3), so that the environment always gets [-1, 1].
+        max_team_size, max_teams: slots to keep ready; None = what is seen at the start.
+        death_masking: members that end while their team plays on keep earning its reward.
+    """
+
+    _has_dynamic_specs = False
+
+    def __init__(
+        self,
+        make_env: Callable[[int], BaseEnv],
+        seed: int = 0,
+        *,
+        action_limit: float = 1.0,
+        max_team_size: int | None = None,
+        max_teams: int | None = None,
+        death_masking: bool = True,
+    ) -> None:
+        super().__init__(device="cpu", batch_size=torch.Size([]), run_type_checks=False)
+        self._make_env = make_env
+        self._limits = (max_teams, max_team_size)
+        self.action_limit = float(action_limit)
+        self.death_masking = death_masking
+        self._open(seed)
+        self._make_specs()
+
+    # --- what a trainer asks for beyond EnvBase
+
+    sides: dict[str, list[str]]  # behaviors of every policy name
+    entry_of: dict[str, str]  # behavior -> TensorDict entry: the policy name where it has one side only
+
+    @property
+    def behaviors(self) -> dict[str, BehaviorRounds]:
+        """The behaviors by name; their specs, slots and arrays."""
+        return self._behaviors
+
+    def pop_episodes(self) -> dict[str, list[Episode]]:
+        """Return the episodes that finished since the last call, a list for each behavior."""
+        out = {name: behavior.finished for name, behavior in self._behaviors.items()}
+        for behavior in self._behaviors.values():
+            behavior.finished = []
+        return out
+
+    def get_state(self) -> dict[str, Any] | None:
+        """Return a snapshot between two rounds, or None if the BaseEnv cannot give one."""
+        snapshot = getattr(self.base_env, "get_state", None)
+        if snapshot is None:
+            return None
+        return {
+            "scene": snapshot(),
+            "behaviors": {name: behavior.get_state() for name, behavior in self._behaviors.items()},
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go back to a snapshot; the next full reset hands out its observations unchanged."""
+        self.base_env.set_state(state["scene"])  # type: ignore[attr-defined]
+        for name, behavior in self._behaviors.items():
+            behavior.set_state(state["behaviors"][name])
+        self._untouched = True
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the BaseEnv."""
+        if not self.is_closed:
+            self.base_env.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+    # --- EnvBase
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        if tensordict is None or not any(k in tensordict.keys(True) for k in self.reset_keys):
+            self._full_reset()
+        return self._root()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for name, behavior in self._behaviors.items():
+            if len(behavior.order):
+                action = tensordict.get((self.entry_of[name], keys.ACTION)).reshape(len(behavior.acting), -1)
+                self.base_env.set_actions(name, behavior.actions(action.numpy(), self.action_limit))
+            behavior.begin_round()
+        self._untouched = False
+        self._play_until_asked()
+        return TensorDict({self.entry_of[name]: self._next(b) for name, b in self._behaviors.items()}, [])
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.base_env.close()
+        self._open(seed or 0)
+
+    def _open(self, seed: int) -> None:
+        self.base_env = self._make_env(int(seed))
+        self._behaviors: dict[str, BehaviorRounds] = {}
+        self.base_env.reset()
+        self._first_results()
+        self._untouched = True
+
+    def _full_reset(self) -> None:
+        if self._untouched:
+            return
+        self.base_env.reset()
+        for behavior in self._behaviors.values():
+            behavior.forget_agents()
+        self._play_until_asked(step_first=False)
+        self._untouched = True
+
+    def _play_until_asked(self, step_first: bool = True) -> None:
+        for attempt in range(MAX_SILENT_STEPS):
+            if step_first or attempt:
+                self.base_env.step()
+            asked = False
+            for name, behavior in self._behaviors.items():
+                decision, terminal = self.base_env.get_steps(name)
+                behavior.add(decision, terminal)
+                asked = asked or len(decision) > 0
+            if asked:
+                break
+        else:
+            raise ConfigError(
+                f"no agent asked for a decision in {MAX_SILENT_STEPS} environment steps; "
+                "does every agent of the scene have a DecisionRequester?"
+            )
+        for behavior in self._behaviors.values():
+            behavior.end_round()
+
+    def _first_results(self) -> None:
+        """Read the behaviors and how many teams and agents they have from the first records."""
+        for _ in range(MAX_SILENT_STEPS):
+            names = list(self.base_env.behavior_specs)
+            decisions = {name: self.base_env.get_steps(name)[0] for name in names}
+            if any(len(d) for d in decisions.values()):
+                break
+            self.base_env.step()
+        else:
+            raise ConfigError("the environment shows no behavior with an agent that asks for a decision")
+        sizes: dict[str, tuple[int, int]] = {}
+        for name in names:
+            policy = keys.policy_name(name)
+            teams, members = _count_teams(decisions[name].agent_id, decisions[name].group_id)
+            seen = sizes.get(policy, (1, 1))
+            sizes[policy] = max(seen[0], teams), max(seen[1], members)
+        for name in names:
+            teams, members = (limit or seen for limit, seen in zip(self._limits, sizes[keys.policy_name(name)]))
+            table = SlotTable(name, teams, members)
+            behavior = BehaviorRounds(name, self.base_env.behavior_specs[name], table, self.death_masking)
+            behavior.add(decisions[name], self.base_env.get_steps(name)[1])
+            behavior.end_round()
+            self._behaviors[name] = behavior
+        self.sides = {keys.policy_name(n): [] for n in names}
+        for name in names:
+            self.sides[keys.policy_name(name)].append(name)
+        self.entry_of = {n: p if len(sides) == 1 else n for p, sides in self.sides.items() for n in sides}
+
+    # --- TensorDicts
+
+    def _shape(self, behavior: BehaviorRounds) -> tuple[int, int]:
+        return behavior.slots.num_teams, behavior.slots.team_size
+
+    def _observe(self, behavior: BehaviorRounds, observations: list[np.ndarray]) -> dict[str, torch.Tensor]:
+        shape = self._shape(behavior)
+        out = {
+            keys.SENSOR.format(i): torch.from_numpy(o.reshape(*shape, *o.shape[1:]))
+            for i, o in enumerate(observations)
+        }
+        for key, flags in (
+            (keys.ACTING, behavior.acting),
+            (keys.PRESENT, behavior.present),
+            (keys.DEPARTED, behavior.departed),
+        ):
+            out[key] = torch.from_numpy(flags.reshape(*shape, 1).copy())
+        if behavior.mask.shape[1]:
+            out[keys.MASK] = torch.from_numpy(behavior.mask.reshape(*shape, -1).copy())
+        return out
+
+    def _next(self, behavior: BehaviorRounds) -> TensorDict:
+        shape = self._shape(behavior)
+        out = self._observe(behavior, behavior.end_obs)
+        for key, values in (
+            (keys.REWARD, behavior.reward),
+            (keys.GROUP_REWARD, behavior.group_reward),
+            (keys.TERMINATED, behavior.terminated),
+            (keys.TRUNCATED, behavior.truncated),
+            (keys.DONE, behavior.terminated | behavior.truncated),
+        ):
+            out[key] = torch.from_numpy(values.reshape(*shape, 1))
+        return TensorDict(out, shape)
+
+    def _root(self) -> TensorDict:
+        out = {}
+        for name, behavior in self._behaviors.items():
+            shape = self._shape(behavior)
+            entries = self._observe(behavior, [o.copy() for o in behavior.obs])
+            for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
+                entries[key] = torch.zeros((*shape, 1), dtype=torch.bool)
+            out[self.entry_of[name]] = TensorDict(entries, shape)
+        return TensorDict(out, [])
+
+    def _make_specs(self) -> None:
+        observation, action, reward, done = {}, {}, {}, {}
+        for behavior_name, behavior in self._behaviors.items():
+            name, shape = self.entry_of[behavior_name], self._shape(behavior)
+            entries: dict[str, Any] = {
+                keys.SENSOR.format(i): Unbounded((*shape, *o.shape[1:])) for i, o in enumerate(behavior.obs)
+            }
+            for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED):
+                entries[key] = Binary(1, (*shape, 1), dtype=torch.bool)
+            if behavior.mask.shape[1]:
+                entries[keys.MASK] = Binary(behavior.mask.shape[1], (*shape, behavior.mask.shape[1]), dtype=torch.bool)
+            observation[name] = Composite(entries, shape=shape)
+            action[name] = Composite(
+                {keys.ACTION: _action_spec(behavior, shape, self.action_limit)}, shape=shape
+            )
+            rewards = {key: Unbounded((*shape, 1)) for key in (keys.REWARD, keys.GROUP_REWARD)}
+            reward[name] = Composite(rewards, shape=shape)
+            ends = {key: Binary(1, (*shape, 1), dtype=torch.bool) for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
+            done[name] = Composite(ends, shape=shape)
+        self.observation_spec = Composite(observation)
+        self.action_spec = Composite(action)
+        self.reward_spec = Composite(reward)
+        self.done_spec = Composite(done)
+
+
+def _count_teams(agent_ids: np.ndarray, group_ids: np.ndarray) -> tuple[int, int]:
+    """Return how many teams these agents form and how large the largest is."""
+    groups, counts = np.unique(group_ids[group_ids > 0], return_counts=True)
+    alone = int((group_ids <= 0).sum())
+    return max(1, len(groups) + alone), max(1, int(counts.max(initial=1)))
+
+
+def _action_spec(behavior: BehaviorRounds, shape: tuple[int, int], limit: float) -> Any:
+    spec = behavior.spec.action_spec
+    size, branches = spec.continuous_size, spec.discrete_branches
+    if not branches:
+        return Bounded(-limit, limit, (*shape, size), dtype=torch.float32)
+    if not size:
+        return MultiCategorical(branches, (*shape, len(branches)), dtype=torch.int64)
+    low = torch.tensor([-limit] * size + [0.0] * len(branches)).expand(*shape, -1)
+    high = torch.tensor([limit] * size + [n - 1e-3 for n in branches]).expand(*shape, -1)
+    return Bounded(low.clone(), high.clone(), dtype=torch.float32)

@@ -1,0 +1,62 @@
+"""Running statistics of returns, so that the critic learns in a normalised space.
+
+In: value targets in the reward's own scale. Out: normalised targets, and critic outputs turned back.
+As in the MAPPO paper's repository (arXiv 2103.01955, section 4): exponential averages of x and x**2
+with debiasing, variance floor 1e-2. TorchRL's norms of that name scale prediction and target inside the loss
+instead, which leaves the critic's output in the reward's scale; hence this module.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+VARIANCE_FLOOR = 1e-2
+
+
+class ValueNorm(nn.Module):
+    """Normalise returns by debiased exponential averages.
+
+    Args:
+        beta: decay of the averages for each update.
+        enabled: False makes it the identity.
+    """
+
+    mean: Tensor
+    mean_sq: Tensor
+    debias: Tensor
+
+    def __init__(self, beta: float, enabled: bool = True) -> None:
+        super().__init__()
+        self.beta, self.enabled = beta, enabled
+        self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean_sq", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("debias", torch.zeros((), dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, returns: Tensor) -> None:
+        """Take returns ``[n]`` into the averages."""
+        if not self.enabled or not returns.numel():
+            return
+        returns = returns.double()
+        self.mean.mul_(self.beta).add_(returns.mean() * (1 - self.beta))
+        self.mean_sq.mul_(self.beta).add_((returns**2).mean() * (1 - self.beta))
+        self.debias.mul_(self.beta).add_(1 - self.beta)
+
+    def statistics(self) -> tuple[float, float]:
+        """Return the debiased mean and standard deviation of returns."""
+        if not self.enabled or float(self.debias) == 0.0:
+            return 0.0, 1.0
+        mean = float(self.mean / self.debias)
+        variance = float(self.mean_sq / self.debias) - mean**2
+        return mean, max(variance, VARIANCE_FLOOR) ** 0.5
+
+    def normalize(self, returns: Tensor) -> Tensor:
+        """Return ``(returns - mean) / std``."""
+        mean, std = self.statistics()
+        return (returns - mean) / std
+
+    def denormalize(self, values: Tensor) -> Tensor:
+        """Return ``values * std + mean``, the critic's output in the reward's scale."""
+        mean, std = self.statistics()
+        return values * std + mean
