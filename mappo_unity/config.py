@@ -8,6 +8,7 @@ about options come at once.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Optional
@@ -84,6 +85,10 @@ class EnvConfig:
     """Team slots of a behavior; null: as many as are seen at the start."""
 
     def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\w.-]*\w[\w.-]*", self.name):
+            raise ConfigError(
+                f"env.name={self.name!r} must consist of letters, digits, '_', '-' and '.': it names a folder"
+            )
         _at_least("env.num_areas", self.num_areas, 1)
         _at_least("env.max_team_size", self.max_team_size, 1)
         _at_least("env.max_teams", self.max_teams, 1)
@@ -170,6 +175,8 @@ class PPOConfig:
     """Clip the move of the critic's output by the clipping interval."""
     normalize_values: bool = True
     """The critic learns returns normalised by running statistics."""
+    value_norm_beta: float = 0.99
+    """Decay, for each batch, of the running statistics of returns."""
     normalize_advantages: bool = True
     """Normalise advantages over the acting agents of a batch."""
     max_grad_norm: float = 0.5
@@ -192,6 +199,7 @@ class PPOConfig:
         _at_least("ppo.entropy_coef", self.entropy_coef, 0)
         _at_least("ppo.entropy_coef_final", self.entropy_coef_final, 0)
         _at_least("ppo.value_coef", self.value_coef, 0)
+        _between("ppo.value_norm_beta", self.value_norm_beta, 0, 1)
         _above("ppo.huber_delta", self.huber_delta, 0)
         _above("ppo.max_grad_norm", self.max_grad_norm, 0)
         _above("ppo.target_kl", self.target_kl, 0)
@@ -255,7 +263,7 @@ class Config:
     num_threads: int = 1
     """Threads of torch; small networks want one."""
     resume: Optional[str] = None
-    """Run folder or checkpoint to continue."""
+    """Run folder or checkpoint file to continue, in the same folder."""
     stop_at_return: Optional[float] = None
     """End the run when return_mean over a full window reaches this."""
     output_dir: str = "outputs"
@@ -267,9 +275,28 @@ class Config:
         _at_least("checkpoint_interval", self.checkpoint_interval, 1)
         _at_least("keep_checkpoints", self.keep_checkpoints, 1)
         _at_least("num_threads", self.num_threads, 1)
+        _rule("stop_at_return", self.stop_at_return, True, "must be a finite number or null")
         kind, _, index = self.device.partition(":")
         if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
             raise ConfigError(f"device={self.device!r} must be one of cpu, cuda, cuda:N")
+
+
+@dataclass
+class EvalConfig:
+    """Options of an evaluation."""
+
+    run: str = "???"
+    """Run folder (its best checkpoint is played) or checkpoint file; must be given."""
+    episodes: int = 100
+    """Agent episodes to play."""
+    deterministic: bool = False
+    """Take the most likely action instead of a sampled one."""
+    seed: int = 0
+    """Seed of the environment and the sampling."""
+
+    def __post_init__(self) -> None:
+        _at_least("episodes", self.episodes, 1)
+        _within("seed", self.seed, 0, 2**31 - 1)
 
 
 def _rule(option: str, value: float | None, holds: bool, rule: str) -> None:

@@ -1,0 +1,159 @@
+"""The commands: the only place that prints. Heavy imports happen inside them.
+
+Exit codes: 0 done, 1 an error of ours (with its traceback) or a failed job of a sweep, 2 a mistake
+in the options, 130 and 143 ended by SIGINT and SIGTERM.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mappo_unity.config import Config, ConfigError, EvalConfig
+
+_SIGNALS = {2: "SIGINT", 15: "SIGTERM"}
+
+
+def train_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-train: train, continue or sweep; return the exit code."""
+    return _run_command("mappo-train", _train_command, _train_help, arguments)
+
+
+def eval_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-eval: play episodes with a trained policy; return the exit code."""
+    return _run_command("mappo-eval", _eval_command, _eval_help, arguments)
+
+
+def _run_command(
+    name: str, command: Callable[[list[str]], int], help_text: Callable[[], str], arguments: list[str] | None
+) -> int:
+    lines = sys.argv[1:] if arguments is None else arguments
+    if any(line in ("--help", "-h") for line in lines):
+        print(help_text())
+        return 0
+    if "--version" in lines:
+        from mappo_unity import __version__
+
+        print(f"{name} {__version__}")
+        return 0
+    try:
+        return command(lines)
+    except ConfigError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted", file=sys.stderr)
+        return 130
+
+
+def _train_help() -> str:
+    from mappo_unity.help import train_help
+
+    return train_help(Config)
+
+
+def _eval_help() -> str:
+    from mappo_unity.help import eval_help
+
+    return eval_help(EvalConfig)
+
+
+def _train_command(lines: list[str]) -> int:
+    from mappo_unity.overrides import given
+
+    if "-m" in lines or "--multirun" in lines:
+        return _sweep([line for line in lines if line not in ("-m", "--multirun")])
+    resume = given(lines, "resume")
+    return _train_anew(lines) if resume is None else _train_on(lines, Path(str(resume)))
+
+
+def _train_anew(lines: list[str]) -> int:
+    from mappo_unity import runs
+    from mappo_unity.compose import check_factory, compose_config
+    from mappo_unity.overrides import given
+
+    composed = compose_config(lines)
+    check_factory(composed.config)
+    folder = runs.create_folder(composed.run_dir, exact=given(lines, "hydra.run.dir") is not None)
+    try:
+        runs.write_record(folder.path, composed.config, lines)
+        return _train(composed.config, folder.path, None)
+    except (ConfigError, KeyboardInterrupt):
+        runs.discard_folder(folder)
+        raise
+
+
+def _train_on(lines: list[str], path: Path) -> int:
+    from mappo_unity import runs
+    from mappo_unity.compose import check_factory, compose_resumed
+
+    folder = runs.find_run(path, "resume")
+    config = compose_resumed(lines, folder / runs.CONFIG)
+    check_factory(config)
+    from mappo_unity.checkpoint import newest_good
+
+    checkpoint, warnings = newest_good(path)
+    for warning in warnings:
+        print(f"mappo-train: {warning}", file=sys.stderr)
+    record = runs.read_record(folder)
+    runs.write_record(folder, config, lines)
+    try:
+        return _train(config, folder, checkpoint)
+    except ConfigError:
+        runs.restore_record(folder, record)
+        raise
+
+
+def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
+    from mappo_unity.train import train
+
+    print(f"continuing from {checkpoint}" if checkpoint else f"run folder: {folder}", flush=True)
+    outcome = train(config, folder, checkpoint)
+    from mappo_unity.report import run_summary
+
+    print("\n".join(run_summary(outcome, folder)), flush=True)
+    if outcome.signal is None:
+        return 0
+    name = _SIGNALS.get(outcome.signal, f"signal {outcome.signal}")
+    print(
+        f"mappo-train: ended by {name}; checkpoint {outcome.last_checkpoint}; "
+        f"continue with: mappo-train resume={folder}",
+        file=sys.stderr,
+    )
+    return 128 + outcome.signal
+
+
+def _sweep(lines: list[str]) -> int:
+    from mappo_unity import report
+    from mappo_unity.sweep import run_sweep
+
+    result = run_sweep(lines)
+    report.write_csv(result)
+    console = report.console()
+    console.print(report.sweep_table(result))
+    console.print(f"sweep folder: {result.folder}", soft_wrap=True, highlight=False)
+    for job in result.jobs:
+        if job.error:
+            print(f"mappo-train: job {job.job} failed: {job.error}", file=sys.stderr)
+    if result.error:
+        print(f"mappo-train: the sweep broke off: {result.error}", file=sys.stderr)
+    return result.exit_code
+
+
+def _eval_command(lines: list[str]) -> int:
+    from mappo_unity.compose import check_factory, compose_plain, load_config
+    from mappo_unity.runs import CONFIG, find_run
+
+    options = vars(compose_plain(lines, EvalConfig))
+    run = Path(options.pop("run"))
+    check_factory(load_config(find_run(run, "run") / CONFIG))
+    from mappo_unity.evaluate import evaluate
+
+    result: dict[str, Any] = evaluate(run, **options)
+    from mappo_unity import report
+
+    report.console().print(report.eval_table(result))
+    print(report.json_line(result))
+    return 0

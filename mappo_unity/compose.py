@@ -1,0 +1,195 @@
+"""Command-line overrides -> a checked `Config`.
+
+In: overrides, the files under conf/ and, when a run goes on, its config.yaml. Out: `Composed`.
+Every mistake is a ConfigError. Nothing is created here, and torch is not imported.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from mappo_unity.config import Config, ConfigError
+from mappo_unity.options import did_you_mean, option_table
+from mappo_unity.overrides import SWEEP_EXTRA, check_overrides, given, open_line, parse
+from mappo_unity.presets import conf_dir, group_choices
+
+_NOISE = ("object_type=", "reference_type=", "Config search path", "provider=", "See ", "To append")
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A checked configuration and the tree it came from (with Hydra's own node)."""
+
+    config: Config
+    tree: DictConfig
+
+    @property
+    def run_dir(self) -> Path:
+        """Folder that hydra.run.dir names."""
+        return Path(str(OmegaConf.select(self.tree, "hydra.run.dir")))
+
+    def sweep_dir(self, env_name: str) -> Path:
+        """Return the folder that hydra.sweep.dir names for jobs of the named environment."""
+        tree = self.tree.copy()
+        tree.env.name = env_name
+        return Path(str(OmegaConf.select(tree, "hydra.sweep.dir")))
+
+
+def compose_config(lines: list[str], base: Path | None = None) -> Composed:
+    """Compose and check the options of one run.
+
+    `base` is the config.yaml of a run that goes on; without it the presets are the base.
+    Raises ConfigError.
+    """
+    check_overrides(lines, Config, group_choices())
+    lines = [open_line(line) for line in lines]
+    store = register_schema()
+    name = "config"
+    if base is not None:
+        name = "resumed"
+        store.store(name=name, node=_resumed_root(base))
+    try:
+        with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+            tree = compose(name, lines, return_hydra_config=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(_explain(error)) from error
+    return Composed(to_config(tree), tree)
+
+
+def register_schema() -> ConfigStore:
+    """Register `Config` as "schema", and the sweep plugins' defaults as ..._plugin.
+
+    conf/hydra holds presets of ours under the plugins' plain names; Hydra refuses to build a preset
+    on a registered one of the same name.
+    """
+    Plugins.instance()  # imports the plugins, which register themselves
+    store = ConfigStore.instance()
+    for choice in SWEEP_EXTRA:
+        group, _, name = choice.partition("=")
+        nodes = store.repo["hydra"][group.partition("/")[2]]
+        node = nodes.pop(f"{name}.yaml", None)
+        if node is not None:
+            nodes[f"{name}_plugin.yaml"] = replace(node, name=f"{name}_plugin.yaml")
+    store.store(name="schema", node=Config)
+    return store
+
+
+def compose_resumed(lines: list[str], base: Path) -> Config:
+    """Compose the options of a run that goes on: its config.yaml, then overrides; raise ConfigError.
+
+    What says which run it is (env, env.name, the folders) cannot be overridden.
+    """
+    saved = load_config(base)
+    chosen = given(lines, "env")
+    if chosen is not None and chosen != saved.env.name:
+        raise ConfigError(
+            f"env={chosen} differs from the run's env={saved.env.name}: a run goes on in its own env; "
+            "leave env out, or start a new run without resume"
+        )
+    rest = [line for line in lines if parse([line])[0].key_or_group != "env"]
+    for key in ("env.name", "output_dir", "hydra.run.dir"):
+        if given(rest, key) is not None:
+            raise ConfigError(
+                f"{key} cannot change with resume: the run goes on in its own folder {base.parent}"
+            )
+    return compose_config(rest, base).config
+
+
+def load_config(path: Path) -> Config:
+    """Return the options that a run's config.yaml holds; raise ConfigError."""
+    return compose_config([], path).config
+
+
+def to_config(tree: DictConfig) -> Config:
+    """Turn a composed tree into the dataclass and run its checks; raise ConfigError."""
+    tree = tree.copy()
+    with open_dict(tree):
+        tree.pop("hydra", None)
+    try:
+        config = OmegaConf.to_object(tree)
+    except OmegaConfBaseException as error:
+        raise ConfigError(_explain(error)) from error
+    assert isinstance(config, Config)
+    return config
+
+
+def compose_plain(lines: list[str], schema: type) -> Any:
+    """Build a dataclass without presets (mappo-eval) from its defaults and overrides; raise ConfigError."""
+    check_overrides(lines, schema, {})
+    tree = OmegaConf.structured(schema)
+    for override in parse(lines):
+        OmegaConf.update(tree, override.key_or_group, override.value(), merge=True)
+    for key in OmegaConf.missing_keys(tree):
+        option = option_table(schema)[key]
+        raise ConfigError(f"{key} is not given: {key}=... ({option.description})")
+    try:
+        return OmegaConf.to_object(tree)
+    except OmegaConfBaseException as error:
+        raise ConfigError(_explain(error)) from error
+
+
+def check_factory(config: Config) -> None:
+    """Check that env.factory, if given, imports and can be called; the working directory counts.
+
+    Raises ConfigError.
+    """
+    factory = config.env.factory
+    if factory is None:
+        return
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    module_name, _, name = factory.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:  # whatever the user's module raises is the user's to see
+        reason = f"{type(error).__name__}: {error}"
+        raise ConfigError(
+            f"env.factory={factory}: the module {module_name} cannot be imported ({reason})"
+        ) from error
+    if not hasattr(module, name):
+        names = [
+            item for item in vars(module) if callable(getattr(module, item)) and not item.startswith("_")
+        ]
+        raise ConfigError(
+            f"env.factory={factory}: {module_name} has no {name}{did_you_mean(name, names)}; "
+            f"callable there: {', '.join(names) or 'nothing'}"
+        )
+    if not callable(getattr(module, name)):
+        kind = type(getattr(module, name)).__name__
+        raise ConfigError(
+            f"env.factory={factory}: {name} is a {kind}, but must be a function that returns a BaseEnv"
+        )
+
+
+def _resumed_root(base: Path) -> dict[Any, Any]:
+    try:
+        saved = OmegaConf.to_container(OmegaConf.load(base))
+    except Exception as error:
+        raise ConfigError(f"{base} cannot be read ({error})") from error
+    if not isinstance(saved, dict):
+        raise ConfigError(f"{base} holds no options")
+    groups = [{group: None} for group in group_choices() if group != "env"]
+    quiet = [{"override hydra/job_logging": "none"}, {"override hydra/hydra_logging": "none"}]
+    return {"defaults": ["schema", "_self_", *groups, *quiet], **saved}
+
+
+def _explain(error: BaseException) -> str:
+    texts = []
+    seen: BaseException | None = error
+    while seen is not None:
+        lines = [line.strip() for line in str(seen).splitlines() if line.strip()]
+        texts.append("; ".join(line for line in lines if not line.startswith(_NOISE)))
+        seen = seen.__cause__
+    return ": ".join(dict.fromkeys(text for text in texts if text))

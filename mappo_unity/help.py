@@ -1,0 +1,87 @@
+"""The text of --help, from the tables of options and choices.
+
+In: a dataclass of options, the files under conf/. Out: text. Imports neither torch nor Hydra, so
+that help comes at once.
+"""
+
+from __future__ import annotations
+
+import shutil
+import textwrap
+
+from mappo_unity.options import Option, option_table, short_type, show_value
+from mappo_unity.presets import all_groups, describe_choices
+
+TRAIN_USAGE = """\
+Train policies with MAPPO on an ML-Agents environment.
+
+Usage:
+  mappo-train [option=value ...]            train; the results are in outputs/<env>/<date>_<time>
+  mappo-train -m [option=value,value ...]   sweep: one run for each combination
+  mappo-train resume=RUN [option=value ...] continue a run folder or a checkpoint
+  mappo-train --help | --version
+
+Examples:
+  mappo-train env=3DBall seed=1
+  mappo-train env=custom env.factory=package.module:function env.params.size=3
+  mappo-train -m env=3DBall seed=0,1,2 ppo.lr=1e-4,3e-4
+  mappo-train -m env=3DBall hydra/sweeper=optuna hydra.sweeper.n_trials=20 hydra/launcher=joblib
+  mappo-train resume=outputs/3DBall/2026-11-20_12-00-00 max_steps=2000000
+"""
+
+EVAL_USAGE = """\
+Play episodes with a trained policy and print their statistics: a table, then one line of JSON.
+
+Usage:
+  mappo-eval run=RUN [option=value ...]     a run folder (its best checkpoint) or a checkpoint
+  mappo-eval --help | --version
+
+Example:
+  mappo-eval run=outputs/3DBall/2026-11-20_12-00-00 episodes=100 deterministic=true
+"""
+
+
+def train_help(schema: type) -> str:
+    """Return the help of mappo-train: usage, choices, options."""
+    choices = [_group_text(group) for group in all_groups()]
+    return "\n".join([TRAIN_USAGE, "Choices (presets in conf/):", *choices, "", option_text(schema)])
+
+
+def eval_help(schema: type) -> str:
+    """Return the help of mappo-eval: usage, options."""
+    return f"{EVAL_USAGE}\n{option_text(schema)}"
+
+
+def option_text(schema: type) -> str:
+    """Return every option of a dataclass with type, default and description, section by section."""
+    table = option_table(schema)
+    lines = ["Options (name: type = default):"]
+    sections = [option for option in table.values() if option.is_section]
+    lines += [
+        _option_text(option) for key, option in table.items() if "." not in key and option not in sections
+    ]
+    for section in sections:
+        inside = [option for option in table.values() if option.key.rpartition(".")[0] == section.key]
+        lines += ["", f"{section.key}.*  {section.description}"]
+        lines += [_option_text(option) for option in inside if not option.is_section]
+    return "\n".join(lines)
+
+
+def _option_text(option: Option) -> str:
+    head = f"  {option.key}: {short_type(option.type)}"
+    default = show_value(option.default)
+    if default != "???":
+        head += f" = {default}"
+    return f"{head}\n{_wrap(option.description, 6)}"
+
+
+def _group_text(group: str) -> str:
+    about = describe_choices(group)
+    lines = [f"  {group}={'|'.join(about)}"]
+    lines += [_wrap(f"{name}: {text}", 6) for name, text in about.items() if text]
+    return "\n".join(lines)
+
+
+def _wrap(text: str, indent: int) -> str:
+    width = min(shutil.get_terminal_size((100, 24)).columns, 110)
+    return textwrap.fill(text, max(width, 40), initial_indent=" " * indent, subsequent_indent=" " * indent)

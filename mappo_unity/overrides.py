@@ -1,0 +1,196 @@
+"""Hydra's override grammar and the checks of single overrides.
+
+In: lines such as ``ppo.lr=1e-4`` and the table of options. Out: parsed overrides, or a ConfigError
+that names the option, its value, the rule and the choices. Composes nothing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep, Override
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mappo_unity.config import Config, ConfigError
+from mappo_unity.options import Option, did_you_mean, find_option, option_table, show_value
+
+SWEEP_EXTRA = {
+    "hydra/launcher=joblib": "hydra_joblib_launcher",
+    "hydra/sweeper=optuna": "hydra_optuna_sweeper",
+}
+"""Presets of conf/hydra that need a plugin, and the plugin's package."""
+
+_LINE = re.compile(r"(?P<prefix>\+\+|\+|~)?(?P<key>[^=+~\s]+)(?P<rest>=.*)?", re.DOTALL)
+
+
+def given(lines: list[str], key: str) -> Any:
+    """Return the value that the overrides give to a key (the last one), or None."""
+    values = [item.value() for item in parse(lines) if item.key_or_group == key and not item.is_delete()]
+    return values[-1] if values else None
+
+
+def parse(lines: list[str]) -> list[Override]:
+    """Parse overrides in Hydra's grammar; raise ConfigError for a line that is not one."""
+    return [_parse_line(line) for line in lines]
+
+
+def open_line(line: str) -> str:
+    """Let new names below an open option do without Hydra's plus signs: ``env.params.mass=2``."""
+    match = _LINE.fullmatch(line)
+    option = find_option(option_table(Config), match["key"]) if match else None
+    is_new = match is not None and match["prefix"] is None and option is not None and option.is_open
+    return f"++{line}" if is_new else line
+
+
+def check_overrides(
+    lines: list[str], schema: type, groups: dict[str, list[str]], sweep: bool = False
+) -> None:
+    """Check names, grammar, choices and types of overrides; `sweep` allows several values.
+
+    Raises ConfigError at the first mistake.
+    """
+    for line in lines:
+        override = _parse_line(line)
+        key = override.key_or_group
+        if override.is_sweep_override() and not sweep:
+            raise ConfigError(
+                f"{line}: several values for {key} make a sweep, which needs -m (mappo-train -m {line})"
+            )
+        if key.startswith(("hydra.", "hydra/")) and groups:
+            _check_sweep_extra(line)
+            continue
+        if key in groups:
+            _check_choice(override, groups[key])
+            continue
+        _check_option(override, line, schema, groups)
+
+
+def quoted(value: str | Path) -> str:
+    """Return a text as a quoted value of Hydra's grammar."""
+    text = str(value).replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{text}'"
+
+
+def _parse_line(line: str) -> Override:
+    if line.startswith("-"):
+        raise ConfigError(
+            f"{line} is not an option: settings are written option=value (seed=1), "
+            "and the only switches are -m, --help and --version"
+        )
+    match = _LINE.fullmatch(line)
+    if match is None:
+        raise ConfigError(f"{line!r} is not of the form option=value (for example seed=1)")
+    if match["rest"] is None and match["prefix"] != "~":
+        raise ConfigError(f"{line} has no value: write {match['key']}=value")
+    try:
+        return OverridesParser.create().parse_override(line)
+    except HydraException as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(
+            f"{line} cannot be read ({reason}): a list is written [1,2], and a text with spaces or any of "
+            f"=,:()[]{{}} stands in quotes inside quotes, {match['key']}='\"like, this\"'"
+        ) from error
+
+
+def _check_sweep_extra(line: str) -> None:
+    package = SWEEP_EXTRA.get(line)
+    if package is not None and not is_installed(f"hydra_plugins.{package}"):
+        raise ConfigError(
+            f"{line} needs the package {package.replace('_', '-')}, which is not installed: "
+            "pip install 'mappo-unity[sweep]'"
+        )
+
+
+def is_installed(module: str) -> bool:
+    """Return whether a module can be found, without importing it."""
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # its parent package is missing
+        return False
+
+
+def _check_choice(override: Override, choices: list[str]) -> None:
+    group = override.key_or_group
+    for value in _values(override):
+        if isinstance(value, str) and value in choices or (value is None and group != "env"):
+            continue
+        name = show_value(value)
+        hint = did_you_mean(name, choices)
+        raise ConfigError(f"{group}={name} does not exist{hint}; choices: {', '.join(choices)}")
+
+
+def _check_option(override: Override, line: str, schema: type, groups: dict[str, list[str]]) -> None:
+    table, key = option_table(schema), override.key_or_group
+    option = find_option(table, key)
+    if option is None or override.package is not None:
+        raise ConfigError(_unknown(key, table, groups))
+    if override.is_delete():
+        if not option.is_open or key == option.key:
+            raise ConfigError(f"{line}: {key} cannot be deleted, only set: {key}=value")
+        return
+    for value in _values(override):
+        _check_value(key, value, schema)
+
+
+def _check_value(key: str, value: Any, schema: type) -> None:
+    table = option_table(schema)
+    option = find_option(table, key)
+    if option is None:
+        raise ConfigError(_unknown(key, table, {}))
+    if option.is_section:
+        if not isinstance(value, dict):
+            inside = ", ".join(_inside(key, table))
+            raise ConfigError(f"{key}={show_value(value)}: {key} is a section; its options: {inside}")
+        for name, item in value.items():
+            _check_value(f"{key}.{name}", item, schema)
+    elif not (isinstance(value, str) and "${" in value):
+        _check_type(key, value, option, schema)
+
+
+def _check_type(key: str, value: Any, option: Option, schema: type) -> None:
+    fits = not (option.type is bool and not isinstance(value, bool))
+    try:
+        OmegaConf.update(OmegaConf.structured(schema), key, value, merge=True, force_add=option.is_open)
+    except (OmegaConfBaseException, ValueError):
+        fits = False
+    if fits:
+        return
+    whole = isinstance(value, float) and value.is_integer()
+    hint = f"; write {int(value)}" if whole and "whole number" in option.wanted else ""
+    raise ConfigError(
+        f"{key}={show_value(value)} does not fit: {key} must be {option.wanted}{hint} ({option.description})"
+    )
+
+
+def _unknown(key: str, table: dict[str, Option], groups: dict[str, list[str]]) -> str:
+    names = [name for name, option in table.items() if not option.is_section] + list(groups)
+    inside = _inside(key.rpartition(".")[0], table)
+    if not inside:
+        sections = [f"{name}.*" for name, option in table.items() if option.is_section]
+        inside = [name for name in names if "." not in name] + sections
+    choices = ", ".join(inside)
+    return f"{key} is not an option{did_you_mean(key, names)}; choices: {choices} (--help describes them)"
+
+
+def _inside(section: str, table: dict[str, Option]) -> list[str]:
+    return [
+        name for name in table if section and name.startswith(section + ".") and not table[name].is_section
+    ]
+
+
+def _values(override: Override) -> Iterator[Any]:
+    value = override.value()
+    if isinstance(value, IntervalSweep):
+        yield value.start
+        yield value.end
+    elif override.is_sweep_override():
+        yield from override.sweep_iterator()
+    else:
+        yield value

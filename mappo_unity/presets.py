@@ -1,0 +1,55 @@
+"""The presets under conf/: where they are, which choices there are, what each says of itself.
+
+In: the folder. Out: names and descriptions. Imports neither torch nor Hydra.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+_BASIC = {  # what Hydra brings itself, and takes by default
+    "hydra/launcher": {"basic": "One job of a sweep after the other (the default)."},
+    "hydra/sweeper": {"basic": "One job for each combination of the values given (the default)."},
+}
+
+
+def conf_dir() -> Path:
+    """Return the folder of presets: inside an installed package, or at the top of a checkout."""
+    package = Path(__file__).resolve().parent
+    inside = package / "conf"
+    return inside if inside.is_dir() else package.parent / "conf"
+
+
+@cache
+def group_choices() -> dict[str, list[str]]:
+    """Return the choices of every group under conf/ (Hydra's own groups left out), sorted."""
+    groups = {}
+    for folder in sorted(path for path in conf_dir().iterdir() if path.is_dir() and path.name != "hydra"):
+        names = sorted((path.stem for path in folder.glob("*.yaml")), key=str.lower)
+        if names:
+            groups[folder.name] = names
+    return groups
+
+
+def all_groups() -> list[str]:
+    """Return every group under conf/, Hydra's own too: env first, Hydra's last."""
+    conf = conf_dir()
+    groups = {path.parent.relative_to(conf).as_posix() for path in conf.rglob("*.yaml")} - {"."}
+    return sorted(groups, key=lambda group: (group.startswith("hydra"), group != "env", group))
+
+
+def describe_choices(group: str) -> dict[str, str]:
+    """Return a group's choices, each with the comment that its file begins with."""
+    files = sorted((conf_dir() / group).glob("*.yaml"), key=lambda path: path.stem.lower())
+    return {**_BASIC.get(group, {}), **{path.stem: _comment(path) for path in files}}
+
+
+def _comment(path: Path) -> str:
+    lines: list[str] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            break
+        if "@package" not in line:
+            lines.append(line.lstrip("# "))
+    return " ".join(lines)

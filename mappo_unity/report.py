@@ -1,0 +1,133 @@
+"""Tables and summaries for people, and their machine-readable twins.
+
+In: results of runs, sweeps and evaluations. Out: rich renderables and text; only the command line
+prints them.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.table import Table
+
+from mappo_unity.sweep import JobResult, SweepResult, job_options, varied_options
+
+if TYPE_CHECKING:
+    from mappo_unity.train import Outcome
+
+RESULTS = "results.csv"
+_PIPE_WIDTH = 160  # columns of a table that nobody's terminal limits
+
+
+def console() -> Console:
+    """Return a console on standard output, wide where it is no terminal."""
+    plain = Console(highlight=False)
+    return plain if plain.is_terminal else Console(highlight=False, width=_PIPE_WIDTH)
+
+
+def run_summary(outcome: Outcome, folder: Path) -> list[str]:
+    """Return the closing lines of a run: figures, where the best policy is, what to type next."""
+    rate = outcome.agent_steps / outcome.wall_s if outcome.wall_s > 0 else math.nan
+    best = outcome.best_checkpoint or outcome.last_checkpoint
+    lines = [
+        f"{outcome.status}: {outcome.agent_steps:,} agent steps in {outcome.wall_s:,.1f} s ({rate:,.0f}/s), "
+        f"mean return {show_number(outcome.return_mean)}"
+    ]
+    if best is not None:
+        lines.append(f"best checkpoint: {best}")
+    return [
+        *lines,
+        f"evaluate:    mappo-eval run={folder}",
+        f"continue:    mappo-train resume={folder}",
+        f"curves:      tensorboard --logdir {folder}",
+    ]
+
+
+def sweep_table(result: SweepResult) -> Table:
+    """Return the jobs of a sweep as a table, best first."""
+    options = varied_options(result.jobs)
+    table = Table(title="Jobs, best first")
+    table.add_column("job", justify="right")
+    for option in options:
+        table.add_column(option)
+    for name in ("return_mean", "agent_steps", "wall_s"):
+        table.add_column(name, justify="right")
+    table.add_column("status")
+    table.add_column("error", overflow="fold")
+    for job in result.jobs:
+        values = [_short(job_options(job).get(option, "")) for option in options]
+        table.add_row(str(job.job), *values, *_figures(job), job.status, job.error or "")
+    return table
+
+
+def write_csv(result: SweepResult) -> Path:
+    """Write the jobs of a sweep, best first, to results.csv in its folder; return the path."""
+    path = result.folder / RESULTS
+    options = list(dict.fromkeys(key for job in result.jobs for key in job_options(job)))
+    figures = ["status", "return_mean", "agent_steps", "wall_s", "error"]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, ["job", *options, *figures], restval="")
+        writer.writeheader()
+        for job in result.jobs:
+            writer.writerow(
+                {"job": job.job, **job_options(job), **{name: getattr(job, name) for name in figures}}
+            )
+    return path
+
+
+def eval_table(result: dict[str, Any]) -> Table:
+    """Return the figures of an evaluation as a table; nested ones by their dotted names."""
+    table = Table(title="Evaluation")
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    for name, value in _flat(result):
+        table.add_row(name.replace("_", " "), show_number(value))
+    return table
+
+
+def json_line(result: dict[str, Any]) -> str:
+    """Return the figures of an evaluation as one line of JSON; not-a-number becomes null."""
+    return json.dumps(_finite(result), default=str, allow_nan=False)
+
+
+def show_number(value: Any) -> str:
+    """Return a figure for reading: four significant decimals, thousands apart, "-" for none."""
+    if value is None or value != value:  # nothing, or not a number
+        return "-"
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return str(value)
+    return (
+        f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.1f}"
+    )
+
+
+def _short(text: str) -> str:
+    try:
+        return f"{float(text):.4g}" if len(text) > 8 else text
+    except ValueError:
+        return text
+
+
+def _figures(job: JobResult) -> tuple[str, str, str]:
+    return show_number(job.return_mean), show_number(job.agent_steps), f"{job.wall_s:,.1f}"
+
+
+def _flat(result: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for name, value in result.items():
+        key = f"{prefix}{name}"
+        rows += _flat(value, f"{key}.") if isinstance(value, dict) else [(key, value)]
+    return rows
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(name): _finite(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,207 @@
+"""Run folders: made without collisions, and the record of how a run came about.
+
+In: paths, a `Config`, override lines. Out: a folder with config.yaml (every option), overrides.yaml
+(the command lines with their dates) and versions.json. Knows nothing of training.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import shutil
+import subprocess
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from mappo_unity.atomic import write_atomically
+from mappo_unity.config import Config, ConfigError
+
+CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
+RECORD = (CONFIG, OVERRIDES, VERSIONS)
+_PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "numpy", "mlagents-envs", "protobuf", "hydra-core")
+
+
+@dataclass(frozen=True)
+class NewFolder:
+    """A folder made for a run, and the folders above it that had to be made (outermost first)."""
+
+    path: Path
+    made: tuple[Path, ...] = ()
+
+
+def create_folder(wanted: Path, exact: bool = False) -> NewFolder:
+    """Make a folder that nobody else has: the wanted name, or that with _1, _2 ... behind it.
+
+    With `exact` (the user named it) the folder may exist if it is empty, and no other name will do.
+    Raises ConfigError where it cannot be made or written.
+    """
+    parents = [parent for parent in reversed(wanted.parents) if not parent.exists()]
+    try:
+        wanted.parent.mkdir(parents=True, exist_ok=True)
+        folder = NewFolder(_claim(wanted, exact), tuple(parents))
+        probe = folder.path / ".probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        for parent in reversed(parents):
+            with suppress(OSError):
+                parent.rmdir()
+        reason = error.strerror or error
+        raise ConfigError(
+            f"the output folder {wanted} cannot be made or written ({reason}: {error.filename}); "
+            "output_dir=FOLDER sets another place"
+        ) from error
+    return folder
+
+
+def discard_folder(folder: NewFolder) -> None:
+    """Remove the folder of a run that never began, unless it holds more than the record."""
+    if _other_files(folder.path):
+        return
+    shutil.rmtree(folder.path)
+    for parent in reversed(folder.made):
+        with suppress(OSError):
+            parent.rmdir()
+
+
+def write_record(folder: Path, config: Config, lines: list[str]) -> None:
+    """Write config.yaml and versions.json, and add the command line to overrides.yaml.
+
+    `resume` is left out of config.yaml: it says how a run was called, not what it is.
+    """
+    lasting = replace(config, resume=None)
+    history = _history(folder / OVERRIDES)
+    history.append({"date": datetime.now().astimezone().isoformat(timespec="seconds"), "overrides": lines})
+    try:
+        write_atomically(folder / OVERRIDES, OmegaConf.to_yaml(OmegaConf.create(history)).encode())
+        write_atomically(folder / VERSIONS, (json.dumps(read_versions(), indent=2) + "\n").encode())
+        write_atomically(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(lasting)).encode())
+    except OSError as error:
+        raise ConfigError(f"the run folder {folder} cannot be written ({error.strerror or error})") from error
+
+
+@dataclass(frozen=True)
+class Record:
+    """The record of a run as it was, and the state of its other files (size in bytes, time in ns)."""
+
+    files: dict[str, bytes]
+    others: dict[Path, tuple[int, int]]
+
+
+def read_record(folder: Path) -> Record:
+    """Return the record of a run, to be put back by `restore_record`."""
+    files = {name: (folder / name).read_bytes() for name in RECORD if (folder / name).is_file()}
+    return Record(files, _other_files(folder))
+
+
+def restore_record(folder: Path, record: Record) -> None:
+    """Put the record back, unless the run went on meanwhile: then what it went on with stays written."""
+    if _other_files(folder) != record.others:
+        return
+    for name in RECORD:
+        if name in record.files:
+            write_atomically(folder / name, record.files[name])
+        else:
+            (folder / name).unlink(missing_ok=True)
+
+
+def find_run(path: Path, option: str) -> Path:
+    """Return the run folder of a run folder or of a checkpoint file in it.
+
+    Raises ConfigError, naming the option, where there is none.
+    """
+    if not path.exists():
+        near = path.parent
+        while not near.exists():
+            near = near.parent
+        raise ConfigError(f"{option}={path} does not exist{_runs_in(near)}")
+    folders = [path] if path.is_dir() else list(path.parents)[:3]
+    for folder in folders:
+        if (folder / CONFIG).is_file():
+            return folder
+    if path.is_dir() and (path.parent / CONFIG).is_file():  # the checkpoints' own folder
+        return path.parent
+    raise ConfigError(
+        f"{option}={path} is neither a run folder nor a checkpoint in one: no {CONFIG} there{_runs_in(path)}"
+    )
+
+
+def read_versions() -> dict[str, Any]:
+    """Return the versions of Python, of this package and its commit, and of what it stands on."""
+    versions: dict[str, Any] = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in ("mappo-unity", *_PACKAGES):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    if versions["mappo-unity"] is None:
+        from mappo_unity import __version__
+
+        versions["mappo-unity"] = __version__
+    return {**versions, **_git_state(Path(__file__).resolve().parents[1])}
+
+
+def _claim(wanted: Path, exact: bool) -> Path:
+    if exact:
+        wanted.mkdir(exist_ok=True)
+        if any(wanted.iterdir()):
+            raise ConfigError(
+                f"the folder {wanted} is not empty, and nothing is overwritten: "
+                f"name another one, or continue the run in it with resume={wanted}"
+            )
+        return wanted
+    for count in range(10_000):
+        path = wanted.with_name(f"{wanted.name}_{count}") if count else wanted
+        try:
+            path.mkdir()
+            return path
+        except FileExistsError:
+            continue
+    raise ConfigError(f"the output folder {wanted} and 10,000 names like it are taken")
+
+
+def _history(path: Path) -> list[Any]:
+    if not path.is_file():
+        return []
+    try:
+        history = OmegaConf.to_container(OmegaConf.load(path))
+    except Exception as error:
+        raise ConfigError(f"{path} cannot be read ({error})") from error
+    return history if isinstance(history, list) else []
+
+
+def _other_files(folder: Path) -> dict[Path, tuple[int, int]]:
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in RECORD)
+    return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
+
+
+def _runs_in(folder: Path, count: int = 5) -> str:
+    if not folder.is_dir():
+        return ""
+    found: list[Path] = []
+    for pattern in ("*", "*/*", "*/*/*", "*/*/*/*"):
+        found += [path.parent for path in folder.glob(f"{pattern}/{CONFIG}")]
+    found = [path for path in found if (path / VERSIONS).is_file()]
+    newest = sorted(found, key=lambda path: (path / CONFIG).stat().st_mtime, reverse=True)[:count]
+    return f"; newest runs below {folder}: {', '.join(map(str, newest))}" if newest else ""
+
+
+def _git_state(checkout: Path) -> dict[str, Any]:
+    if not (checkout / ".git").exists():
+        return {}
+    try:
+        commit = _git(checkout, "rev-parse", "HEAD").strip()
+        return {"git_commit": commit, "git_dirty": bool(_git(checkout, "status", "--porcelain").strip())}
+    except (OSError, subprocess.SubprocessError):
+        return {}
+
+
+def _git(checkout: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(checkout), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout

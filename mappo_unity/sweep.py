@@ -1,0 +1,271 @@
+"""Sweeps: many runs from one command line, through Hydra's sweepers and launchers.
+
+In: overrides with several values, or a search (hydra/sweeper=optuna). Out: a folder with one run
+folder a job, each with its result.json. A job that fails leaves the others alone.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import signal
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+
+from mappo_unity.atomic import write_atomically
+from mappo_unity.compose import Composed, check_factory, compose_config, to_config
+from mappo_unity.config import Config, ConfigError
+from mappo_unity.overrides import check_overrides, given, open_line, parse, quoted
+from mappo_unity.presets import conf_dir, group_choices
+from mappo_unity.runs import NewFolder, create_folder, discard_folder, write_record
+
+RESULT = "result.json"
+GOOD = ("finished", "solved")
+_SEVERAL = "several"  # stands for env.name in the sweep's folder where the jobs differ in it
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal ended a job, and with it the sweep."""
+
+    def __init__(self, number: int = signal.SIGINT) -> None:
+        super().__init__(number)
+        self.signal = int(number)
+
+
+@dataclass
+class JobResult:
+    """What result.json holds of a job; wall_s in seconds, agent_steps in agent decisions."""
+
+    job: int
+    overrides: list[str]
+    status: str
+    return_mean: float | None = None
+    agent_steps: int | None = None
+    wall_s: float = 0.0
+    error: str | None = None
+
+
+@dataclass
+class SweepResult:
+    """What became of a sweep: its folder, its jobs (best first) and how it ended."""
+
+    folder: Path
+    jobs: list[JobResult] = field(default_factory=list)
+    signal: int | None = None
+    error: str | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """0 if every job succeeded, 128 + signal if one ended the sweep, else 1."""
+        if self.signal is not None:
+            return 128 + self.signal
+        return 0 if self.jobs and not self.error and all(job.status in GOOD for job in self.jobs) else 1
+
+
+def run_sweep(lines: list[str]) -> SweepResult:
+    """Check every job's options, then run the jobs; raises ConfigError before the first one starts."""
+    planned = plan_jobs(lines)
+    folder = _sweep_folder(lines, planned)
+    result = SweepResult(folder.path)
+    try:
+        with _termination_as_interrupt():
+            _launch([*_without(lines, "hydra.sweep.dir"), f"hydra.sweep.dir={quoted(folder.path)}"])
+    except KeyboardInterrupt as error:
+        result.signal = getattr(error, "signal", int(signal.SIGINT))
+    except HydraException as error:
+        discard_folder(folder)
+        raise ConfigError(f"the sweep cannot start: {error}") from error
+    except Exception as error:
+        traceback.print_exc()
+        result.error = f"{type(error).__name__}: {error}"
+    result.jobs = _rank(_read_results(folder.path) + _missing(folder.path, planned))
+    return result
+
+
+def plan_jobs(lines: list[str]) -> list[list[str]]:
+    """Return the overrides of each job of a grid, all checked; one job with what is fixed for a search.
+
+    Raises ConfigError.
+    """
+    check_overrides(lines, Config, group_choices(), sweep=True)
+    if given(lines, "resume") is not None:
+        raise ConfigError("resume cannot be swept: continue one run at a time, without -m")
+    task = [line for line in lines if not _is_hydra(line)]
+    hydra = [line for line in lines if _is_hydra(line)]
+    if is_search(lines):
+        fixed = [line for line in task if not parse([line])[0].is_sweep_override()]
+        jobs = [fixed]
+    else:
+        _refuse_intervals(task)
+        jobs = [list(job) for job in BasicSweeper.split_arguments(parse(task), None)[0]]
+    for job in jobs:
+        check_factory(_compose_job(job, hydra).config)
+    return jobs
+
+
+def is_search(lines: list[str]) -> bool:
+    """Return whether a sweeper other than Hydra's grid decides on the jobs."""
+    return given(lines, "hydra/sweeper") not in (None, "basic")
+
+
+def run_job(tree: DictConfig) -> float | None:
+    """Run one job in the folder that Hydra gave it, write result.json, return return_mean.
+
+    Never raises for a failure of the job (it is in the result); raises Interrupted where a signal
+    ended it, so that the sweep ends too.
+    """
+    hydra = HydraConfig.get()
+    folder = Path(hydra.runtime.output_dir)
+    result = JobResult(int(hydra.job.num), [line.lstrip("+") for line in hydra.overrides.task], "failed")
+    print(f"job {result.job}: {' '.join(result.overrides)}", flush=True)
+    start_s = time.monotonic()
+    ended_by: int | None = None
+    try:
+        ended_by = _train(to_config(tree), folder, result)
+    except KeyboardInterrupt as error:
+        result.status = "interrupted"
+        ended_by = getattr(error, "signal", int(signal.SIGINT))
+    except Exception as error:
+        result.error = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
+        (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
+    result.wall_s = round(result.wall_s or time.monotonic() - start_s, 3)
+    write_atomically(folder / RESULT, (json.dumps(asdict(result), indent=2) + "\n").encode())
+    if ended_by is not None:
+        raise Interrupted(ended_by)
+    return result.return_mean
+
+
+def varied_options(jobs: list[JobResult]) -> list[str]:
+    """Return the options in which the jobs differ, in the order of the command line."""
+    values: dict[str, set[str]] = {}
+    for job in jobs:
+        for key, value in job_options(job).items():
+            values.setdefault(key, set()).add(value)
+    return [key for key, seen in values.items() if len(seen) > 1]
+
+
+def job_options(job: JobResult) -> dict[str, str]:
+    """Return a job's overrides by option name."""
+    pairs = (line.partition("=") for line in job.overrides)
+    return {key: value for key, _, value in pairs}
+
+
+def _train(config: Config, folder: Path, result: JobResult) -> int | None:
+    write_record(folder, config, result.overrides)
+    check_factory(config)
+    from mappo_unity.train import train
+
+    outcome = train(config, folder)
+    result.status = outcome.status
+    mean = outcome.return_mean
+    result.return_mean = mean if mean is not None and math.isfinite(mean) else None
+    result.agent_steps = outcome.agent_steps
+    result.wall_s = outcome.wall_s
+    return outcome.signal
+
+
+def _quieten() -> None:
+    """Keep the search's own log off the terminal: our table tells, and failed jobs tell themselves."""
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    logging.getLogger("hydra_plugins").setLevel(logging.ERROR)
+
+
+def _launch(lines: list[str]) -> None:
+    if given(lines, "hydra/sweeper") == "optuna":
+        _quieten()
+    GlobalHydra.instance().clear()
+    search_path = create_config_search_path(str(conf_dir()))
+    hydra = Hydra.create_main_hydra2("mappo-train", search_path)
+    try:
+        hydra.multirun("config", run_job, [open_line(line) for line in lines])
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def _sweep_folder(lines: list[str], jobs: list[list[str]]) -> NewFolder:
+    hydra = [line for line in lines if _is_hydra(line)]
+    composed = [_compose_job(job, hydra) for job in jobs]
+    names = {item.config.env.name for item in composed}
+    name = names.pop() if len(names) == 1 else _SEVERAL
+    return create_folder(composed[0].sweep_dir(name), exact=given(lines, "hydra.sweep.dir") is not None)
+
+
+def _compose_job(job: list[str], hydra: list[str]) -> Composed:
+    try:
+        return compose_config([*job, *hydra])
+    except ConfigError as error:
+        raise ConfigError(f"{error} (in the job {' '.join(job) or 'as given'})") from error
+
+
+def _refuse_intervals(lines: list[str]) -> None:
+    for line in lines:
+        override = parse([line])[0]
+        if override.is_sweep_override() and not override.is_discrete_sweep():
+            raise ConfigError(
+                f"{line}: an interval has no list of values; search it with hydra/sweeper=optuna, "
+                f"or give values: {override.key_or_group}=a,b,c"
+            )
+
+
+def _read_results(folder: Path) -> list[JobResult]:
+    found = sorted(folder.rglob(RESULT))
+    return [JobResult(**json.loads(path.read_text(encoding="utf-8"))) for path in found]
+
+
+def _missing(folder: Path, planned: list[list[str]]) -> list[JobResult]:
+    """Return the jobs of a grid that left no result: not started, or their process died."""
+    multirun = folder / "multirun.yaml"
+    if not multirun.is_file():  # a search writes none: nobody knows its jobs beforehand
+        return []
+    done = {job.job for job in _read_results(folder)}
+    return [
+        JobResult(number, [line.lstrip("+") for line in job], "no result")
+        for number, job in enumerate(planned)
+        if number not in done
+    ]
+
+
+def _rank(jobs: list[JobResult]) -> list[JobResult]:
+    def key(job: JobResult) -> tuple[bool, float, int]:
+        mean = job.return_mean
+        return (mean is None, -mean if mean is not None else 0.0, job.job)
+
+    return sorted(jobs, key=key)
+
+
+def _is_hydra(line: str) -> bool:
+    return line.lstrip("+~").startswith(("hydra.", "hydra/"))
+
+
+def _without(lines: list[str], key: str) -> list[str]:
+    return [line for line in lines if parse([line])[0].key_or_group != key]
+
+
+@contextmanager
+def _termination_as_interrupt() -> Iterator[None]:
+    """Between jobs, let SIGTERM end a sweep as Ctrl-C does: with its table and its exit code."""
+
+    def interrupt(number: int, frame: Any) -> None:
+        raise Interrupted(number)
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
