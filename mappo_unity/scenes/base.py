@@ -1,0 +1,480 @@
+"""The stepping loop that every embedded scene stands on: Unity ML-Agents' framework rules, vectorised.
+
+In: a scene's declarations and hooks. Out: a `mlagents_envs.base_env.BaseEnv`. Knows no scene.
+
+How to write a scene (`ball3d.py` is the shortest example): subclass `Scene`, declare the class attributes,
+and implement the hooks. All hooks work on *slots* (see `agents.py`): integer arrays that select agents of
+all areas at once; slot // agents_per_area is the area. No Python loop over agents.
+
+    class MyScene(Scene):
+        NAME, DEFAULT_NUM_AREAS, MAX_STEP = "MyScene", 12, 5000
+        BEHAVIORS = (Behavior("MyScene?team=0", (Sensor("VectorSensor_size8", (8,)),), continuous=2),)
+        def __init__(self, **options):
+            super().__init__(**options)      # then build arrays and physics; do not draw numbers yet
+        def begin_episode(self, slots): ...  # OnEpisodeBegin
+        def observe(self, behavior, slots): ...  # one new float32 array [n, *shape] a sensor, unstacked
+        def act(self, slots): ...            # OnActionReceived; reads self.agents.continuous / .discrete
+        def simulate(self): ...              # physics of one tick, then collision callbacks
+        def scene_state(self), load_scene_state(self, state)
+
+One tick, in Unity's order: `fixed_update` (agents' own FixedUpdate) -> [first tick only: `begin_episode` of
+all] -> decisions asked, counters + 1, `observe` for those asked, exchange with Python if any record waits
+-> `act` -> MaxStep -> `controllers` (scripts after the academy) -> `simulate`.
+Hooks change rewards and episodes with `set_reward`, `add_reward`, `add_group_reward`, `end_episode`,
+`disable`, `enable`, `switch_behavior`; all of them accept integer slots or a boolean mask over slots.
+Use Unity's numbers and axes (x right, y up, z forward) everywhere, in MuJoCo too: gravity along -y, and
+mirrored algebra is the same algebra (only MuJoCo's quaternions are w first).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from mlagents_envs.base_env import (
+    ActionTuple,
+    BaseEnv,
+    BehaviorMapping,
+    BehaviorSpec,
+    DecisionSteps,
+    TerminalSteps,
+)
+from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
+
+from mappo_unity.config import ConfigError
+from mappo_unity.scenes.agents import Agents
+from mappo_unity.scenes.records import TerminalQueue, steps_from_state, steps_state
+from mappo_unity.scenes.specs import Behavior, Parameter, checked_parameter
+from mappo_unity.scenes.stacks import Stacks
+
+
+class Scene(BaseEnv):
+    """Run N areas of a Unity example scene under ML-Agents' rules, without Unity.
+
+    Arguments of every scene: `num_areas` copies of the playing area (None: as many as Unity's scene),
+    `num_threads` for physics, `seed` of the one random generator `self.rng`, and environment parameters.
+    """
+
+    NAME: ClassVar[str]
+    """Name of the scene."""
+    DEFAULT_NUM_AREAS: ClassVar[int] = 1
+    """Areas of the Unity scene."""
+    BEHAVIORS: ClassVar[tuple[Behavior, ...]]
+    """Behaviors, in the order in which Unity lists them."""
+    AREA_BEHAVIORS: ClassVar[tuple[int, ...]] = (0,)
+    """First behavior (index) of each agent of an area; the order gives the agent ids."""
+    AREA_GROUPS: ClassVar[tuple[int, ...]] = (-1,)
+    """Group of each agent of an area, from 0 in creation order; -1: none (group id 0)."""
+    DECISION_PERIOD: ClassVar[int] = 5
+    """Ticks between two decisions."""
+    TAKE_ACTIONS_BETWEEN_DECISIONS: ClassVar[bool] = True
+    """Whether `act` runs every tick, or only in ticks of a decision."""
+    MAX_STEP: ClassVar[int] = 0
+    """Ticks after which an agent's episode is interrupted; 0: never."""
+    PARAMETERS: ClassVar[Mapping[str, Parameter]] = {}
+    """Environment parameters that the scene reads."""
+
+    def __init__(
+        self, *, num_areas: int | None = None, num_threads: int = 1, seed: int = 0, **parameters: float
+    ) -> None:
+        self.num_areas = _at_least_one("num_areas", num_areas or self.DEFAULT_NUM_AREAS, num_areas)
+        self.num_threads = _at_least_one("num_threads", num_threads, num_threads)
+        self.rng = np.random.default_rng(_seed(seed))
+        self.agents_per_area = len(self.AREA_BEHAVIORS)
+        self.num_slots = self.num_areas * self.agents_per_area
+        self.parameters = {name: known.default for name, known in self.PARAMETERS.items()}
+        for name, value in parameters.items():
+            self.parameters[name] = checked_parameter(self.NAME, self.PARAMETERS, name, value)
+        self._specs = [behavior.spec() for behavior in self.BEHAVIORS]
+        self._index = {behavior.name: i for i, behavior in enumerate(self.BEHAVIORS)}
+        self.agents = Agents(
+            np.tile(np.array(self.AREA_BEHAVIORS), self.num_areas),
+            self.home_groups(),
+            max(behavior.continuous for behavior in self.BEHAVIORS),
+            max(len(behavior.branches) for behavior in self.BEHAVIORS),
+        )
+        sensors = [sensor for behavior in self.BEHAVIORS for sensor in behavior.sensors]
+        self._stacks = Stacks(sensors, self.num_slots)
+        self._queue = TerminalQueue(self._specs)
+        self._empty = [DecisionSteps.empty(spec) for spec in self._specs]
+        self._results: list[tuple[DecisionSteps, TerminalSteps]] = []
+        self._actions: dict[int, ActionTuple] = {}
+        self._asked = np.zeros(0, np.int64)
+        self._asked_rows: list[np.ndarray] = [self._asked for _ in self.BEHAVIORS]
+        self.counter = 0  # the academy's step count: ticks since the start or the last env.reset()
+        self._closed = False
+
+    # ---- hooks of a scene -------------------------------------------------------------------------------
+
+    def begin_episode(self, slots: np.ndarray) -> None:
+        """Begin new episodes of `slots` (OnEpisodeBegin); draw from `self.rng` here."""
+        raise NotImplementedError
+
+    def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
+        """Return one new array float32 ``[len(slots), *sensor.shape]`` a sensor, without stacking."""
+        raise NotImplementedError
+
+    def act(self, slots: np.ndarray) -> None:
+        """Execute the stored actions of `slots`; give rewards, end episodes (OnActionReceived)."""
+        raise NotImplementedError
+
+    def simulate(self) -> None:
+        """Advance physics by one tick, then handle contacts; those may end episodes too."""
+
+    def fixed_update(self) -> None:
+        """Run the agents' own FixedUpdate, before the academy's step of this tick."""
+
+    def controllers(self) -> None:
+        """Run scripts that follow the academy's step (area timers), before physics."""
+
+    def decides(self) -> bool | np.ndarray:
+        """Return who asks for a decision this tick: all, none, or a mask bool over slots."""
+        return self.counter % self.DECISION_PERIOD == 0
+
+    def action_mask(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
+        """Return one bool ``[len(slots), branch size]`` a discrete branch, True = forbidden."""
+        return [np.zeros((len(slots), size), bool) for size in self.BEHAVIORS[behavior].branches]
+
+    def parameter_changed(self, name: str) -> None:
+        """Apply a parameter that acts at once (gravity); others are read at the next reset."""
+
+    def scene_state(self) -> dict[str, Any]:
+        """Return everything of the scene that a snapshot needs, as numpy arrays and plain values."""
+        return {}
+
+    def load_scene_state(self, state: dict[str, Any]) -> None:
+        """Restore what `scene_state` returned."""
+
+    # ---- what hooks call --------------------------------------------------------------------------------
+
+    def set_reward(self, slots: np.ndarray, value: np.ndarray | float) -> None:
+        """Replace the reward since the last decision record (SetReward)."""
+        self.agents.reward[slots] = value
+
+    def add_reward(self, slots: np.ndarray, value: np.ndarray | float) -> None:
+        """Add to the reward since the last decision record (AddReward); no slot twice in one call."""
+        self.agents.reward[slots] += value
+
+    def add_group_reward(self, slots: np.ndarray, value: np.ndarray | float) -> None:
+        """Add a group's reward; pass all slots of the group, those that have left it get none."""
+        self.agents.group_reward[slots] += np.where(self.agents.group_id[slots] > 0, value, 0)
+
+    def end_episode(self, slots: np.ndarray, interrupted: bool = False) -> None:
+        """End episodes of enabled `slots`: terminal records now, then `begin_episode`.
+
+        Serves EndEpisode, EndGroupEpisode (pass all slots of the group) and, with `interrupted`, their
+        time limits. An agent that already ended since its last decision sends no second record.
+        """
+        slots = self._enabled_slots(slots)
+        if slots.size:
+            self._send_terminals(slots, interrupted)
+            self.agents.clear_actions(slots)
+            self.agents.step_count[slots] = 0
+            self.begin_episode(slots)
+
+    def disable(self, slots: np.ndarray) -> None:
+        """Disable agents: terminal records (not interrupted), then they leave their groups."""
+        slots = self._enabled_slots(slots)
+        self._send_terminals(slots, False)
+        self.agents.disable(slots)
+
+    def enable(self, slots: np.ndarray, group_ids: np.ndarray | int = 0) -> None:
+        """Enable disabled agents of `slots` under new ids, in their order, and begin their episodes.
+
+        `group_ids`: a group id a slot (`home_groups()[slots]`: as at the start) or one for all.
+        """
+        slots = _as_slots(slots)
+        keep = ~self.agents.enabled[slots]
+        slots = slots[keep]
+        if slots.size:
+            self.agents.enable(slots, group_ids[keep] if isinstance(group_ids, np.ndarray) else group_ids)
+            self._stacks.clear(slots)
+            if self.started:
+                self.begin_episode(slots)
+
+    def switch_behavior(self, slots: np.ndarray, behavior: np.ndarray | int) -> None:
+        """Move agents to another behavior (SetModel), whether it differs or not.
+
+        An agent that has not ended since its last decision sends a terminal record under its old
+        behavior, not interrupted; no episode begins. `behavior`: an index, or one a slot.
+        """
+        slots = _as_slots(slots)
+        behavior = np.broadcast_to(behavior, slots.shape)
+        keep = self.agents.enabled[slots]
+        self._send_terminals(slots[keep], False)
+        self.agents.move(slots, behavior)
+
+    def home_groups(self) -> np.ndarray:
+        """Return the group id of every slot at the start, int32 [S]: numbered from 1, area by area."""
+        per_area = np.array(self.AREA_GROUPS)
+        first = np.arange(self.num_areas)[:, None] * (per_area.max() + 1) + 1
+        return np.where(per_area >= 0, first + per_area, 0).astype(np.int32).ravel()
+
+    @property
+    def started(self) -> bool:
+        """Whether the first env.reset() has happened."""
+        return bool(self._results)
+
+    # ---- BaseEnv ----------------------------------------------------------------------------------------
+
+    @property
+    def behavior_specs(self) -> BehaviorMapping:
+        """Return the specs of all behaviors, complete from the start."""
+        return BehaviorMapping({b.name: spec for b, spec in zip(self.BEHAVIORS, self._specs, strict=True)})
+
+    def reset(self) -> None:
+        """Reset as Unity's academy does: the first time tick 0, later at the exchange of a running tick.
+
+        A later reset sends no terminal records and clears neither stacks nor rewards; the running tick
+        ends with zero actions, so the first records after it are one tick old.
+        """
+        self._check_open()
+        if self.started:
+            self._actions.clear()
+            self.counter = 0
+            self.agents.step_count[:] = 0
+            slots = self.agents.order
+            self.agents.clear_actions(slots)
+            self.begin_episode(slots)
+            self._finish_tick()
+        self._run_to_exchange()
+
+    def step(self) -> None:
+        """Go on until some agent reports: asks for a decision, or has ended."""
+        self._check_open()
+        if not self.started:
+            return self.reset()
+        self._store_actions()
+        self._finish_tick()
+        self._run_to_exchange()
+
+    def close(self) -> None:
+        """Release the scene; further steps are an error."""
+        self._closed = True
+
+    def get_steps(self, behavior_name: str) -> tuple[DecisionSteps, TerminalSteps]:
+        """Return the decision and terminal steps of the last exchange."""
+        behavior = self._behavior(behavior_name)
+        if not self.started:
+            raise UnityActionException(f"behavior {behavior_name} has no steps yet: call reset() first")
+        return self._results[behavior]
+
+    def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
+        """Set the actions of all agents in the last decision steps, in their order."""
+        behavior = self._behavior(behavior_name)
+        count = len(self._asked_rows[behavior])
+        self._actions[behavior] = self._checked_action(behavior, action, self._asked_rows[behavior], count)
+
+    def set_action_for_agent(self, behavior_name: str, agent_id: int, action: ActionTuple) -> None:
+        """Set the action of one agent in the last decision steps; those never set act with zeros."""
+        behavior = self._behavior(behavior_name)
+        slots = self._asked_rows[behavior]
+        row = np.flatnonzero(self.agents.agent_id[slots] == agent_id)
+        if not row.size:
+            raise IndexError(f"agent {agent_id} of {behavior_name} did not request a decision")
+        action = self._checked_action(behavior, action, slots[row], 1)
+        spec = self._specs[behavior].action_spec
+        stored = self._actions.setdefault(behavior, spec.empty_action(len(slots)))
+        stored.continuous[row], stored.discrete[row] = action.continuous, action.discrete
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set an environment parameter; the scene's sheet says when it takes effect."""
+        self.parameters[name] = checked_parameter(self.NAME, self.PARAMETERS, name, value)
+        self.parameter_changed(name)
+
+    # ---- snapshots --------------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Return an exact snapshot between two calls of `step`, made of dicts, lists, arrays and values."""
+        return {
+            "scene": self.NAME,
+            "num_areas": self.num_areas,
+            "counter": self.counter,
+            "rng": self.rng.bit_generator.state,
+            "parameters": dict(self.parameters),
+            "agents": self.agents.get_state(),
+            "stacks": self._stacks.get_state(),
+            "asked": self._asked.copy(),
+            "results": [[steps_state(d), steps_state(t)] for d, t in self._results],
+            "actions": {
+                self.BEHAVIORS[i].name: [action.continuous.copy(), action.discrete.copy()]
+                for i, action in self._actions.items()
+            },
+            "state": self.scene_state(),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore a snapshot of a scene of the same name and number of areas.
+
+        Raises ConfigError: the snapshot belongs to another scene or another number of areas.
+        """
+        for key, mine in (("scene", self.NAME), ("num_areas", self.num_areas)):
+            if state.get(key) != mine:
+                raise ConfigError(f"the snapshot has {key}={state.get(key)!r}, this scene {key}={mine!r}")
+        self.counter = state["counter"]
+        self.rng.bit_generator.state = state["rng"]
+        self.parameters = dict(state["parameters"])
+        self.agents.set_state(state["agents"])
+        self._stacks.set_state(state["stacks"])
+        self._queue.clear()
+        self._results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]  # type: ignore[misc]
+        self._set_asked(state["asked"].copy())
+        self._actions = {
+            self._index[name]: ActionTuple(parts[0].copy(), parts[1].copy())
+            for name, parts in state["actions"].items()
+        }
+        self.load_scene_state(state["state"])
+
+    # ---- the tick ---------------------------------------------------------------------------------------
+
+    def _run_to_exchange(self) -> None:
+        while not self._begin_tick():
+            self._finish_tick()
+
+    def _begin_tick(self) -> bool:
+        """Run a tick up to the exchange with Python; return whether there is one."""
+        agents = self.agents
+        self.fixed_update()
+        if not self.started:
+            self.begin_episode(agents.order)
+        decides = self.decides()
+        if decides is False:
+            self._set_asked(agents.order[:0])
+        else:
+            self._set_asked(agents.order if decides is True else agents.order[decides[agents.order]])
+        self.counter += 1
+        agents.step_count += 1
+        if not self._asked.size and not len(self._queue) and self.started:
+            return False
+        self._results = [self._result(behavior) for behavior in range(len(self.BEHAVIORS))]
+        return True
+
+    def _finish_tick(self) -> None:
+        """Run a tick from the exchange with Python to its end."""
+        slots = self.agents.order if self.TAKE_ACTIONS_BETWEEN_DECISIONS else self._asked
+        if slots.size:
+            self.act(slots)
+        if self.MAX_STEP:
+            late = self.agents.step_count >= self.MAX_STEP
+            if late.any():
+                self.end_episode(late, interrupted=True)
+        self.controllers()
+        self.simulate()
+
+    def _result(self, behavior: int) -> tuple[DecisionSteps, TerminalSteps]:
+        terminals = self._queue.take(behavior)
+        slots = self._asked_rows[behavior]
+        if not slots.size:
+            return self._empty[behavior], terminals
+        agents = self.agents
+        decisions = DecisionSteps(
+            self._observations(behavior, slots),
+            agents.reward[slots],
+            agents.agent_id[slots],
+            self.action_mask(behavior, slots) if self.BEHAVIORS[behavior].branches else None,
+            agents.group_id[slots],
+            agents.group_reward[slots],
+        )
+        agents.reward[slots] = 0
+        agents.group_reward[slots] = 0
+        agents.done[slots] = False
+        return decisions, terminals
+
+    def _observations(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
+        frames = self.observe(behavior, slots)
+        sensors = self.BEHAVIORS[behavior].sensors
+        assert [frame.shape[1:] for frame in frames] == [sensor.shape for sensor in sensors], behavior
+        return [
+            self._stacks.push(sensor, slots, frame) for sensor, frame in zip(sensors, frames, strict=True)
+        ]
+
+    def _send_terminals(self, slots: np.ndarray, interrupted: bool) -> None:
+        agents = self.agents
+        slots = slots[~agents.done[slots]]
+        if not slots.size:
+            return
+        for behavior in range(len(self.BEHAVIORS)):
+            rows = slots if len(self.BEHAVIORS) == 1 else slots[agents.behavior[slots] == behavior]
+            if rows.size:
+                steps = TerminalSteps(
+                    self._observations(behavior, rows),
+                    agents.reward[rows],
+                    np.full(rows.size, interrupted),
+                    agents.agent_id[rows],
+                    agents.group_id[rows],
+                    agents.group_reward[rows],
+                )
+                self._queue.add(behavior, steps)
+        self._stacks.clear(slots)
+        agents.finish(slots)
+
+    def _store_actions(self) -> None:
+        agents = self.agents
+        agents.clear_actions(self._asked)
+        for behavior, action in self._actions.items():
+            slots = self._asked_rows[behavior]
+            agents.continuous[slots, : action.continuous.shape[1]] = action.continuous
+            agents.discrete[slots, : action.discrete.shape[1]] = action.discrete
+        self._actions.clear()
+
+    def _set_asked(self, slots: np.ndarray) -> None:
+        self._asked = slots
+        if slots is self.agents.order:
+            self._asked_rows = [self.agents.members(i) for i in range(len(self.BEHAVIORS))]
+        else:
+            self._asked_rows = [slots[self.agents.behavior[slots] == i] for i in range(len(self.BEHAVIORS))]
+
+    # ---- checks -----------------------------------------------------------------------------------------
+
+    def _enabled_slots(self, slots: np.ndarray) -> np.ndarray:
+        slots = _as_slots(slots)
+        return slots[self.agents.enabled[slots]]
+
+    def _behavior(self, name: str) -> int:
+        if name not in self._index:
+            raise UnityActionException(
+                f"scene {self.NAME} has no behavior {name!r}; it has {list(self._index)}"
+            )
+        return self._index[name]
+
+    def _checked_action(
+        self, behavior: int, action: ActionTuple, slots: np.ndarray, count: int
+    ) -> ActionTuple:
+        """Return a copy of `action` after checks of shape, finiteness and branch sizes."""
+        declared = self.BEHAVIORS[behavior]
+        spec: BehaviorSpec = self._specs[behavior]
+        spec.action_spec._validate_action(action, count, declared.name)
+        continuous, discrete = action.continuous, action.discrete
+        bad = ~np.isfinite(continuous).all(axis=1)
+        if declared.branches:
+            bad |= ((discrete < 0) | (discrete >= np.array(declared.branches))).any(axis=1)
+        if bad.any():
+            row = int(np.flatnonzero(bad)[0])
+            raise UnityActionException(
+                f"action of agent {int(self.agents.agent_id[slots[row]])} of {declared.name} is invalid: "
+                f"continuous {continuous[row].tolist()} must be finite, discrete {discrete[row].tolist()} "
+                f"within branches {list(declared.branches)}"
+            )
+        return ActionTuple(continuous.copy(), discrete.copy())
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise UnityEnvironmentException(f"scene {self.NAME} is closed")
+
+
+def _as_slots(slots: np.ndarray) -> np.ndarray:
+    slots = np.asarray(slots)
+    return np.flatnonzero(slots) if slots.dtype == bool else slots.reshape(-1)
+
+
+def _at_least_one(option: str, value: int, given: object) -> int:
+    if isinstance(given, bool) or not isinstance(value, (int, np.integer)) or value < 1 or given == 0:
+        raise ConfigError(f"{option}={given!r} must be a whole number >= 1")
+    return int(value)
+
+
+def _seed(seed: int) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ConfigError(f"seed={seed!r} must be a whole number >= 0")
+    return int(seed)

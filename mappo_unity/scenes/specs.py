@@ -1,0 +1,94 @@
+"""What a scene declares: sensors, behaviors and environment parameters.
+
+In: plain declarations at the top of a scene's module. Out: the `BehaviorSpec` that ML-Agents shows.
+Knows nothing of stepping.
+"""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from mlagents_envs.base_env import (
+    ActionSpec,
+    BehaviorSpec,
+    DimensionProperty,
+    ObservationSpec,
+    ObservationType,
+)
+
+from mappo_unity.config import ConfigError
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Describe one sensor of a behavior; the order in `Behavior.sensors` is the order of `obs_i`.
+
+    Sensors of one name share their frame stack, so an agent that moves between behaviors which list
+    the same sensor keeps its frames.
+    """
+
+    name: str
+    """Name without the stacking prefix, e.g. ``"RayPerceptionSensor"``."""
+    shape: tuple[int, ...]
+    """Shape of one frame, without agents and without stacking."""
+    stack: int = 1
+    """Frames shown at once, concatenated along the first axis, oldest first."""
+    dimension_property: tuple[DimensionProperty, ...] | None = None
+    """One flag a dimension; None: NONE for every dimension."""
+
+    def spec(self) -> ObservationSpec:
+        """Return the sensor as ML-Agents shows it, stacking included."""
+        shape = (self.shape[0] * self.stack, *self.shape[1:])
+        flags = self.dimension_property or (DimensionProperty.NONE,) * len(shape)
+        name = self.name if self.stack == 1 else f"StackingSensor_size{self.stack}_{self.name}"
+        return ObservationSpec(shape, flags, ObservationType.DEFAULT, name)
+
+
+@dataclass(frozen=True)
+class Behavior:
+    """Describe one behavior: its full name, its sensors and its actions."""
+
+    name: str
+    """Full name with the side, e.g. ``"SoccerTwos?team=1"``."""
+    sensors: tuple[Sensor, ...]
+    """Sensors in the order of the sheet (sorted by their full names)."""
+    continuous: int = 0
+    """Number of continuous actions."""
+    branches: tuple[int, ...] = ()
+    """Sizes of the discrete branches."""
+
+    def spec(self) -> BehaviorSpec:
+        """Return the behavior as ML-Agents shows it."""
+        return BehaviorSpec(
+            [sensor.spec() for sensor in self.sensors], ActionSpec(self.continuous, self.branches)
+        )
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Describe one float environment parameter: its default and its open lower bound."""
+
+    default: float
+    """Value used until another one is set."""
+    above: float = -math.inf
+    """Values must be greater than this."""
+
+
+def checked_parameter(scene: str, known: Mapping[str, Parameter], name: str, value: object) -> float:
+    """Return `value` as a float, or raise `ConfigError` naming the parameters that `scene` has."""
+    if name not in known:
+        raise ConfigError(
+            f"scene {scene} has no parameter {name!r}; choices: {', '.join(sorted(known)) or 'none'} "
+            f"(besides num_areas and num_threads)"
+        )
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(float(value)):
+        raise ConfigError(f"parameter {name}={value!r} of scene {scene} must be a finite number")
+    number = float(value)
+    if number <= known[name].above:
+        raise ConfigError(
+            f"parameter {name}={value} of scene {scene} is out of range: it must be > {known[name].above:g}"
+        )
+    return number
