@@ -53,7 +53,7 @@ class UnityEnv(EnvBase):
         max_teams: int | None = None,
         death_masking: bool = True,
     ) -> None:
-        super().__init__(device="cpu", batch_size=torch.Size([]), run_type_checks=False)
+        super().__init__(device=None, batch_size=torch.Size([]), run_type_checks=False)
         self._make_env = make_env
         self._limits = (max_teams, max_team_size)
         self.action_limit = float(action_limit)

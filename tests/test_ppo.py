@@ -1,0 +1,149 @@
+"""The learner: first ratio, masks, rollback, schedules."""
+
+import copy
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from mappo_unity.actions import ActionLayout
+from mappo_unity.config import Activation, ModelConfig, PPOConfig, Schedule, ValueLoss
+from mappo_unity.models import make_actor, make_critic
+from mappo_unity.ppo import LEARNS, PolicyLearner
+
+T, G, A, OBS = 12, 5, 2, 3
+
+
+def make_learner(layout=ActionLayout(2, ()), **options):
+    torch.manual_seed(0)
+    model = ModelConfig(hidden=[16], activation=Activation.tanh)
+    cfg = PPOConfig(**({"minibatch_size": 40} | options))
+    return PolicyLearner(make_actor(OBS, layout, model), make_critic(OBS, model), cfg, T * G, A)
+
+
+def make_batch(learner, acting=None):
+    shape = (T, G, A)
+    flags = torch.ones(*shape, 1, dtype=torch.bool)
+    batch = TensorDict({"observation": torch.randn(*shape, OBS) * 4 + 1, "acting": flags if acting is None else acting}, shape)
+    if learner.actor[0].module.layout.branches:
+        batch["action_mask"] = torch.ones(*shape, sum(learner.actor[0].module.layout.branches), dtype=torch.bool)
+    with torch.no_grad():
+        out = learner.actor(batch.clone())
+    batch["action"], batch["action_log_prob"] = out["action"], out["action_log_prob"]
+    none = torch.zeros(*shape, 1, dtype=torch.bool)
+    batch["next"] = TensorDict(
+        {
+            "observation": torch.randn(*shape, OBS),
+            "acting": batch["acting"].roll(-1, 0),
+            "reward": torch.randn(*shape, 1),
+            "group_reward": torch.zeros(*shape, 1),
+            "terminated": torch.rand(*shape, 1) < 0.05,
+            "truncated": none,
+            "done": none,
+        },
+        shape,
+    )
+    return batch
+
+
+@pytest.mark.parametrize("layout", [ActionLayout(2, ()), ActionLayout(0, (3, 2)), ActionLayout(1, (4,))])
+def test_the_first_minibatch_has_ratio_one_and_kl_zero(layout):
+    learner = make_learner(layout)
+    for round_number in range(3):  # after the normalisers have moved, too
+        batch = make_batch(learner)
+        rows, _ = learner._prepare(batch)
+        learner.buffer.empty()
+        learner.buffer.extend(rows)
+        first = next(iter(learner.buffer))
+        terms = learner._step(first)
+        assert learner.loss.log_ratio.abs().max() < 1e-5
+        assert terms["kl"].abs() < 1e-6
+        assert terms["clip_fraction"] == 0
+        learner.learn(make_batch(learner), 0.0)
+
+
+def test_rows_in_which_nobody_acted_carry_no_loss():
+    acting = torch.ones(T, G, A, 1, dtype=torch.bool)
+    acting[::2] = False
+    learner = make_learner()
+    batch = make_batch(learner, acting)
+    rows, _ = learner._prepare(batch)
+    # five rounds of decisions with their outcomes; of the sixth only what ended in the last round
+    ended_last = batch["next", "terminated"][-1]
+    assert len(rows) == (T // 2 - 1) * G + int(ended_last.any(1).sum())
+    assert int(rows[LEARNS].sum()) == (T // 2 - 1) * G * A + int(ended_last.sum())
+    # garbage in rows without a decision changes nothing
+    other = batch.clone()
+    quiet = ~acting.expand_as(batch["observation"])
+    other["observation"] = torch.where(quiet, 777.0, batch["observation"])
+    other["action"] = torch.where(~acting, 99.0, batch["action"])
+    twin = copy.deepcopy(learner)
+    torch.manual_seed(1)
+    first = learner.learn(batch, 0.0)
+    torch.manual_seed(1)
+    second = twin.learn(other, 0.0)
+    assert first["policy_loss"] == second["policy_loss"] and first["value_loss"] == second["value_loss"]
+    for one, two in zip(learner.params, twin.params):
+        assert torch.equal(one, two)
+
+
+def test_an_update_that_turns_nan_is_taken_back_and_counted():
+    learner = make_learner()
+    before = copy.deepcopy(learner._trainable_state())
+    batch = make_batch(learner)
+    batch["action_log_prob"][3, 2, 1] = math.nan
+    metrics = learner.learn(batch, 0.0)
+    assert metrics["rolled_back"] == 1.0 and metrics["rollbacks"] == 1.0
+    after = learner._trainable_state()
+    for part in ("actor", "critic"):
+        for name in before[part]:
+            if "norm." not in name:
+                assert torch.equal(before[part][name], after[part][name]), name
+    assert learner.learn(make_batch(learner), 0.0)["rolled_back"] == 0.0
+
+
+def test_an_update_whose_kl_explodes_is_taken_back():
+    learner = make_learner(lr=0.5, epochs=8, max_kl=0.05)
+    metrics = learner.learn(make_batch(learner), 0.0)
+    assert metrics["kl_last"] > 0.05 and metrics["rolled_back"] == 1.0
+
+
+def test_target_kl_stops_the_epochs_early():
+    eager = make_learner(lr=3e-2, epochs=10, target_kl=1e-3, max_kl=100.0)
+    assert eager.learn(make_batch(eager), 0.0)["kl_stopped"] == 1.0
+    calm = make_learner(lr=1e-6, epochs=2, target_kl=1e-3)
+    assert calm.learn(make_batch(calm), 0.0)["kl_stopped"] == 0.0
+
+
+def test_schedules_reach_the_optimizer_and_the_loss():
+    learner = make_learner(
+        lr=1e-3, lr_final=1e-4, clip_schedule=Schedule.linear, clip_epsilon=0.3, entropy_coef=0.02, entropy_coef_final=0.01
+    )
+    metrics = learner.learn(make_batch(learner), 0.5)
+    assert metrics["lr"] == pytest.approx(5.5e-4)
+    assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(5.5e-4)
+    assert float(learner.loss.clip_epsilon) == pytest.approx(0.2)
+    assert float(learner.loss.entropy_coeff) == pytest.approx(0.015)
+
+
+def test_the_huber_threshold_is_the_one_asked_for():
+    learner = make_learner(value_loss=ValueLoss.huber, huber_delta=4.0, value_coef=1.0)
+    rows, _ = learner._prepare(make_batch(learner))
+    rows["value_target"] = torch.linspace(-30, 30, rows["value_target"].numel()).view_as(rows["value_target"])
+    value = learner.critic(rows.clone())["state_value"]
+    expected = torch.nn.functional.huber_loss(value, rows["value_target"], delta=4.0)
+    assert learner.loss(rows)["loss_critic"].item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_state_goes_on_to_the_bit():
+    one, two = make_learner(), make_learner()
+    one.learn(make_batch(one), 0.0)
+    two.load_state_dict(copy.deepcopy(one.state_dict()))
+    batch = make_batch(one)
+    for learner in (one, two):
+        torch.manual_seed(5)
+        learner.learn(batch.clone(), 0.1)
+    for a, b in zip(one.params, two.params):
+        assert torch.equal(a, b)
+    assert one.value_norm.statistics() == two.value_norm.statistics()
