@@ -30,7 +30,7 @@ __all__ = ["RunLog", "check_backends", "read_metrics"]
 
 def check_backends(cfg: LogConfig) -> None:
     """Raise ConfigError where a logger's package is not installed; quick, imports nothing."""
-    for backend in (LogBackend.tensorboard, LogBackend.wandb, LogBackend.mlflow):
+    for backend in (LogBackend.wandb, LogBackend.mlflow):
         if backend in cfg.backends and importlib.util.find_spec(backend.name) is None:
             raise ConfigError(
                 f"log.backends has {backend.name}, but the package {backend.name} is not installed: "
