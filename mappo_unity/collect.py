@@ -23,4 +23,5 @@ def make_collector(env: EnvBase, policy: JointPolicy, cfg: CollectConfig) -> Col
         track_traj_ids=False,
         use_buffers=False,
         trust_policy=True,
+        auto_register_policy_transforms=False,
     )

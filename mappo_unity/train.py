@@ -6,6 +6,7 @@ collect, learn, count, log, save.
 
 from __future__ import annotations
 
+import logging
 import math
 import random
 import signal
@@ -19,7 +20,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from mappo_unity import checkpoint, keys
+from mappo_unity import checkpoint
 from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.backend import make_env_function
 from mappo_unity.collect import make_collector
@@ -27,6 +28,7 @@ from mappo_unity.config import Config, ConfigError
 from mappo_unity.log import RunLog
 from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
 from mappo_unity.models import JointPolicy, make_actor, make_critic
+from mappo_unity.policies import describe_spec
 from mappo_unity.ppo import PolicyLearner
 from mappo_unity.transforms import transformed
 from mappo_unity.unity_env import UnityEnv
@@ -63,6 +65,7 @@ def train(cfg: Config, folder: Path, resume_from: Path | None = None) -> Outcome
 def prepare_torch(cfg: Config) -> None:
     """Set threads and seeds; check the device."""
     torch.set_num_threads(cfg.num_threads)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every storage
     if cfg.device.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigError(f"device={cfg.device}: this torch finds no CUDA device; use device=cpu")
     random.seed(cfg.seed)
@@ -272,15 +275,7 @@ class Trainer:
 
 def describe_policies(env: UnityEnv) -> dict[str, Any]:
     """Return what a network must fit: sensors and actions of every policy name."""
-    out = {}
-    for name, sides in env.sides.items():
-        spec = env.behaviors[sides[0]].spec
-        out[name] = {
-            "sensors": [list(o.shape) for o in spec.observation_specs],
-            "continuous": int(spec.action_spec.continuous_size),
-            "branches": [int(n) for n in spec.action_spec.discrete_branches],
-        }
-    return out
+    return {name: describe_spec(env.behaviors[sides[0]].spec) for name, sides in env.sides.items()}
 
 
 def check_fits(path: Path, state: dict[str, Any], cfg: Config, layout: dict[str, Any]) -> None:

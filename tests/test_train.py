@@ -1,0 +1,195 @@
+"""Runs: the same seed gives the same run; a run that is cut goes on to the same end, to the bit."""
+
+import csv
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mappo_unity import checkpoint
+from mappo_unity.checkpoint import CheckpointError
+from mappo_unity.config import CollectConfig, Config, ConfigError, EnvConfig, LogConfig, ModelConfig, PPOConfig
+from mappo_unity.train import Trainer, train
+
+TIMES = {"wall_s", "steps_per_s", "collect_s", "update_s"}
+AREAS, ROUNDS = 6, 20
+BATCH = AREAS * ROUNDS
+TINY = [
+    "env=3DBall",
+    f"env.num_areas={AREAS}",
+    f"collect.rounds={ROUNDS}",
+    "ppo.minibatch_size=60",
+    "model.hidden=[16]",
+    "log.backends=[csv]",
+]
+
+
+def options(iterations, **changes):
+    cfg = Config(
+        env=EnvConfig(num_areas=AREAS),
+        model=ModelConfig(hidden=[16]),
+        ppo=PPOConfig(minibatch_size=60),
+        collect=CollectConfig(rounds=ROUNDS),
+        log=LogConfig(backends=[], progress=False),
+        max_steps=iterations * BATCH,
+        checkpoint_interval=BATCH,
+    )
+    return replace(cfg, **changes)
+
+
+def rows(folder):
+    with open(folder / "metrics.csv", newline="") as file:
+        return [{k: v for k, v in row.items() if k not in TIMES} for row in csv.DictReader(file)]
+
+
+def without_times(state):
+    return {k: v for k, v in state.items() if k not in ("wall_s",)}
+
+
+def assert_same(a, b, where="state"):
+    assert type(a) is type(b), where
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, list):
+        assert len(a) == len(b), where
+        for index, (x, y) in enumerate(zip(a, b)):
+            assert_same(x, y, f"{where}[{index}]")
+    elif isinstance(a, torch.Tensor):
+        assert torch.equal(a.nan_to_num(), b.nan_to_num()) if a.is_floating_point() else torch.equal(a, b), where
+    else:
+        assert a == b or (a != a and b != b), where
+
+
+def test_the_same_seed_gives_the_same_run(tmp_path):
+    train(options(4), tmp_path / "a")
+    train(options(4), tmp_path / "b")
+    train(options(4, seed=1), tmp_path / "c")
+    assert len(rows(tmp_path / "a")) == 4
+    assert rows(tmp_path / "a") == rows(tmp_path / "b")
+    assert rows(tmp_path / "a") != rows(tmp_path / "c")
+
+
+def test_four_iterations_are_two_saved_and_two_more_to_the_bit(tmp_path):
+    whole = train(options(4), tmp_path / "whole")
+    # the schedules look at max_steps, so the first half is cut after two iterations, not shortened
+    trainer = Trainer(options(4), tmp_path / "parts")
+    real_save = trainer.save
+
+    def save_and_stop():
+        real_save()
+        if trainer.iteration == 2:
+            raise KeyboardInterrupt
+
+    trainer.save = save_and_stop
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    trainer.close()
+    path, warnings = checkpoint.newest_good(tmp_path / "parts")
+    assert path.name == f"step_{2 * BATCH:012d}.pt" and not warnings
+    resumed = train(options(4), tmp_path / "parts", path)
+    assert rows(tmp_path / "whole") == rows(tmp_path / "parts")
+    first, second = (checkpoint.load(o.last_checkpoint) for o in (whole, resumed))
+    assert_same(without_times(first), without_times(second))
+
+
+def test_resume_refuses_another_env_network_or_minibatch(tmp_path):
+    outcome = train(options(1), tmp_path)
+    other_model = options(2, model=ModelConfig(hidden=[8]))
+    with pytest.raises(CheckpointError, match=r"another network: model\.hidden=\[16\] there, \[8\] here"):
+        train(other_model, tmp_path, outcome.last_checkpoint)
+    state = checkpoint.load(outcome.last_checkpoint)
+    checkpoint.save(tmp_path / "other.pt", state | {"env_name": "Walker"})
+    with pytest.raises(CheckpointError, match="env=Walker, not for env=3DBall"):
+        train(options(2), tmp_path, tmp_path / "other.pt")
+    with pytest.raises(ConfigError, match="ppo.minibatch_size=121 is larger than the batch.*120 decisions"):
+        train(options(1, ppo=PPOConfig(minibatch_size=121)), tmp_path / "x")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_cuda_without_cuda(tmp_path):
+    with pytest.raises(ConfigError, match="device=cuda: this torch finds no CUDA device"):
+        train(options(1, device="cuda"), tmp_path)
+
+
+def test_stop_at_return_ends_the_run_when_the_mean_holds(tmp_path):
+    outcome = train(options(200, stop_at_return=0.0, log=LogConfig(backends=[], return_window=5)), tmp_path)
+    assert outcome.status == "solved"
+    assert outcome.agent_steps < 200 * BATCH
+    assert outcome.return_mean >= 0.0
+
+
+def test_checkpoints_come_at_their_interval_and_rotate(tmp_path):
+    train(options(10, checkpoint_interval=2 * BATCH, keep_checkpoints=3), tmp_path)
+    steps = [int(p.stem.split("_")[1]) // BATCH for p in checkpoint.checkpoints_in(tmp_path)]
+    assert steps == [6, 8, 10]
+
+
+def command(*arguments):
+    return [sys.executable, "-c", "from mappo_unity.cli import train_main; raise SystemExit(train_main())", *arguments]
+
+
+def start(folder, *arguments, **kwargs):
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(command(*arguments), cwd=folder, env=environment, text=True, stderr=subprocess.PIPE, stdout=subprocess.PIPE, **kwargs)
+
+
+def wait_for_rows(folder, count, process):
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        files = list(folder.glob("**/metrics.csv"))
+        if files and len(files[0].read_text().splitlines()) > count:
+            return files[0].parent
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    raise AssertionError("the run wrote no metrics")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_end_with_a_checkpoint_a_line_and_their_exit_code(tmp_path, number, code):
+    process = start(tmp_path, *TINY, "max_steps=100000000", "checkpoint_interval=100000000")
+    run = wait_for_rows(tmp_path, 3, process)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert f"ended by {number.name}" in errors and f"resume={run.relative_to(tmp_path)}" in errors
+    assert "Traceback" not in errors
+    last = checkpoint.checkpoints_in(run)[-1]
+    assert checkpoint.load(last)["iteration"] == len(rows(run))
+
+
+@pytest.mark.slow
+def test_twenty_kills_end_like_an_undisturbed_run(tmp_path):
+    steps = ["max_steps=60000", "checkpoint_interval=1500", "hydra.run.dir=run"]
+    (tmp_path / "whole").mkdir()
+    process = start(tmp_path / "whole", *TINY, *steps)
+    process.communicate(timeout=300)
+    assert process.returncode == 0
+    generator = random.Random(0)
+    kills, folder = 0, tmp_path / "cut"
+    folder.mkdir()
+    arguments = [*TINY, *steps]
+    while kills < 20:
+        process = start(folder, *arguments)
+        if kills == 0:
+            wait_for_rows(folder, 15, process)
+        else:
+            time.sleep(generator.uniform(1.5, 4.5))
+        if process.poll() is not None:
+            break
+        process.kill()
+        process.communicate()
+        kills += 1
+        arguments = ["resume=run"]
+    process = start(folder, "resume=run")
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert rows(folder / "run") == rows(tmp_path / "whole" / "run")
+    assert kills == 20
