@@ -94,7 +94,7 @@ def _train_on(lines: list[str], path: Path) -> int:
     check_factory(config)
     from mappo_unity.checkpoint import newest_good
 
-    checkpoint, warnings = newest_good(path)
+    checkpoint, warnings = newest_good(path if path.is_file() else folder)
     for warning in warnings:
         print(f"mappo-train: {warning}", file=sys.stderr)
     record = runs.read_record(folder)

@@ -159,18 +159,20 @@ def check_factory(config: Config) -> None:
             f"env.factory={factory}: the module {module_name} cannot be imported ({reason})"
         ) from error
     if not hasattr(module, name):
-        names = [
-            item for item in vars(module) if callable(getattr(module, item)) and not item.startswith("_")
-        ]
+        names = [item for item, value in vars(module).items() if _is_own_function(value, module_name)]
         raise ConfigError(
             f"env.factory={factory}: {module_name} has no {name}{did_you_mean(name, names)}; "
-            f"callable there: {', '.join(names) or 'nothing'}"
+            f"callable there: {', '.join(names[:20]) or 'nothing of its own'}"
         )
     if not callable(getattr(module, name)):
         kind = type(getattr(module, name)).__name__
         raise ConfigError(
             f"env.factory={factory}: {name} is a {kind}, but must be a function that returns a BaseEnv"
         )
+
+
+def _is_own_function(value: Any, module: str) -> bool:
+    return callable(value) and getattr(value, "__module__", None) == module
 
 
 def _resumed_root(base: Path) -> dict[Any, Any]:

@@ -1,0 +1,341 @@
+"""The commands from outside: help, exit codes, run folders, resume, evaluation."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import yaml
+from fake_training import Outcome
+
+from mappo_unity import __version__
+from mappo_unity.cli import eval_main, train_main
+from mappo_unity.config import Config, ConfigError, EvalConfig
+from mappo_unity.options import option_table
+from mappo_unity.presets import all_groups, describe_choices
+from mappo_unity.runs import create_folder, find_run, read_versions
+
+
+class FakeTraining:
+    """Stand in for mappo_unity.train and mappo_unity.checkpoint; keep the calls."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Config, Path, Path | None]] = []
+        self.outcome = Outcome()
+        self.error: BaseException | None = None
+        self.writes = True
+
+    def train(self, cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+        self.calls.append((cfg, folder, checkpoint))
+        if self.writes:
+            (folder / "metrics.csv").write_text("agent_steps\n")
+        if self.error is not None:
+            raise self.error
+        return self.outcome
+
+    def newest_good(self, where: Path) -> tuple[Path, list[str]]:
+        if where.name == "empty":
+            raise ConfigError(f"{where} holds no checkpoint")
+        return where / "checkpoints" / "step_1.pt", ["step_2.pt is damaged"]
+
+
+@pytest.fixture
+def training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeTraining:
+    fake = FakeTraining()
+    for name, function in (("train", fake.train), ("checkpoint", fake.newest_good)):
+        module = ModuleType(f"mappo_unity.{name}")
+        setattr(module, function.__name__, function)
+        monkeypatch.setitem(sys.modules, f"mappo_unity.{name}", module)
+    monkeypatch.chdir(tmp_path)
+    return fake
+
+
+def new_run() -> Path:
+    (folder,) = Path("outputs/3DBall").iterdir()
+    return folder
+
+
+# --- help
+
+
+@pytest.mark.parametrize("command", ["train_main", "eval_main"])
+def test_help_comes_at_once_without_torch(command: str) -> None:
+    check = "assert 'torch' not in sys.modules"
+    code = f"import sys; from mappo_unity.cli import {command} as m; m(['-h']); {check}"
+    start_s = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert time.monotonic() - start_s < 2
+    table = option_table(Config if command == "train_main" else EvalConfig)
+    for key, option in table.items():
+        assert (f"{key}.*" if option.is_section else f"{key}: ") in done.stdout
+        assert re.sub(r"\s+", " ", option.description) in re.sub(r"\s+", " ", done.stdout)
+
+
+def test_help_lists_every_choice(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train_main(["-h"]) == 0
+    text = capsys.readouterr().out
+    for group in all_groups():
+        assert f"{group}={'|'.join(describe_choices(group))}" in text
+    assert "hydra/launcher=basic|joblib" in text
+    assert "ppo.lr: float = 0.0003" in text
+    assert "model.hidden: [int] = [128,128]" in text
+
+
+def test_a_mistake_is_told_without_torch(tmp_path: Path) -> None:
+    code = (
+        "import sys; from mappo_unity.cli import train_main; code = train_main(['ppo.gama=1']);"
+        "assert 'torch' not in sys.modules; sys.exit(code)"
+    )
+    root = str(Path(__file__).resolve().parents[1])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": root},
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "did you mean ppo.gamma" in done.stderr and "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train_main(["--version"]) == 0
+    assert capsys.readouterr().out == f"mappo-train {__version__}\n"
+
+
+# --- a run
+
+
+def test_a_run_leaves_its_record(training: FakeTraining, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train_main(["seed=4", "ppo.lr=1e-3"]) == 0
+    folder = new_run()
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d", folder.name)
+    config, given_folder, checkpoint = training.calls[0]
+    assert (config.seed, config.ppo.lr, given_folder, checkpoint) == (4, 1e-3, folder, None)
+    saved = yaml.safe_load((folder / "config.yaml").read_text())
+    assert saved["ppo"]["lr"] == 1e-3 and saved["log"]["backends"] == ["csv", "tensorboard"]
+    assert set(saved) == set(vars(Config()))
+    assert yaml.safe_load((folder / "overrides.yaml").read_text())[0]["overrides"] == [
+        "seed=4",
+        "ppo.lr=1e-3",
+    ]
+    assert json.loads((folder / "versions.json").read_text())["mappo-unity"] == __version__
+    out = capsys.readouterr().out
+    for word in (
+        "1,000 agent steps",
+        "500/s",
+        "12.5",
+        f"mappo-eval run={folder}",
+        f"resume={folder}",
+        "tensorboard",
+    ):
+        assert word in out
+
+
+def test_runs_never_collide(training: FakeTraining) -> None:
+    wanted = Path("outputs/x/now")
+    names = [create_folder(wanted).path.name for _ in range(4)]
+    assert names == ["now", "now_1", "now_2", "now_3"]
+
+
+def test_a_folder_that_the_user_names_is_never_overwritten(
+    training: FakeTraining, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train_main(["hydra.run.dir=mine"]) == 0
+    before = (Path("mine") / "overrides.yaml").read_text()
+    assert train_main(["hydra.run.dir=mine"]) == 2
+    message = capsys.readouterr().err
+    assert "mine is not empty" in message and "resume=mine" in message
+    assert (Path("mine") / "overrides.yaml").read_text() == before
+
+
+def test_a_place_that_cannot_be_written_is_told(
+    training: FakeTraining, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("taken").write_text("a file")
+    assert train_main(["output_dir=taken"]) == 2
+    message = capsys.readouterr().err
+    assert "taken" in message and "output_dir=" in message
+    assert training.calls == [] and Path("taken").read_text() == "a file"
+
+
+@pytest.mark.parametrize(
+    "line", ["env=Nope", "ppo.gamma=7", "seed=x", "sed=1", "seed", "ppo.lr=[", "seed=1,2"]
+)
+def test_a_mistake_makes_nothing(
+    line: str, training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train_main([line]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("mappo-train: ")
+    assert training.calls == [] and list(tmp_path.iterdir()) == []
+
+
+def test_a_mistake_that_the_training_finds_leaves_nothing(
+    training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training.writes, training.error = False, ConfigError("device=cuda: there is none")
+    assert train_main(["device=cuda"]) == 2
+    assert "device=cuda: there is none" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_run_has_done_outlives_its_error(training: FakeTraining) -> None:
+    training.error = ConfigError("the disk is full")
+    assert train_main([]) == 2
+    assert (new_run() / "metrics.csv").is_file()
+
+
+def test_a_bug_shows_itself(training: FakeTraining) -> None:
+    training.error = RuntimeError("a bug")
+    with pytest.raises(RuntimeError, match="a bug"):
+        train_main([])
+
+
+@pytest.mark.parametrize(("signal", "name", "code"), [(2, "SIGINT", 130), (15, "SIGTERM", 143)])
+def test_signals_have_their_exit_codes(
+    signal: int, name: str, code: int, training: FakeTraining, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training.outcome = Outcome("interrupted", signal, last_checkpoint=Path("step_7.pt"))
+    assert train_main([]) == code
+    message = capsys.readouterr().err
+    assert name in message and "step_7.pt" in message and f"resume={new_run()}" in message
+
+
+def test_an_interruption_before_the_start_leaves_nothing(training: FakeTraining, tmp_path: Path) -> None:
+    training.writes, training.error = False, KeyboardInterrupt()
+    assert train_main([]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- going on
+
+
+def test_a_run_goes_on_in_its_folder(training: FakeTraining, capsys: pytest.CaptureFixture[str]) -> None:
+    train_main(["seed=4", "max_steps=10"])
+    folder = new_run()
+    assert train_main([f"resume={folder}", "max_steps=20"]) == 0
+    config, given_folder, checkpoint = training.calls[1]
+    assert (config.seed, config.max_steps) == (4, 20)
+    assert given_folder == folder and checkpoint == folder / "checkpoints" / "step_1.pt"
+    assert new_run() == folder
+    captured = capsys.readouterr()
+    assert "step_2.pt is damaged" in captured.err and "continuing from" in captured.out
+    history = yaml.safe_load((folder / "overrides.yaml").read_text())
+    assert [entry["overrides"] for entry in history] == [
+        ["seed=4", "max_steps=10"],
+        [f"resume={folder}", "max_steps=20"],
+    ]
+    saved = yaml.safe_load((folder / "config.yaml").read_text())
+    assert saved["max_steps"] == 20 and saved["resume"] is None
+
+
+def test_a_refused_continuation_changes_nothing(training: FakeTraining) -> None:
+    train_main([])
+    folder = new_run()
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    training.writes, training.error = False, ConfigError("another network")
+    assert train_main([f"resume={folder}", "model.hidden=[3]"]) == 2
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_what_cannot_go_on_is_told(training: FakeTraining, capsys: pytest.CaptureFixture[str]) -> None:
+    train_main(["hydra.run.dir=empty"])
+    capsys.readouterr()
+    Path("other").mkdir()
+    for line, words in (
+        ("resume=nowhere", ["resume=nowhere does not exist", "empty"]),
+        ("resume=other", ["resume=other is neither a run folder nor a checkpoint"]),
+        ("resume=empty", ["empty holds no checkpoint"]),
+    ):
+        assert train_main([line]) == 2
+        message = capsys.readouterr().err
+        for word in words:
+            assert word in message
+    assert len(training.calls) == 1
+    assert train_main([f"resume={Path('empty')}", "env=custom"]) == 2
+    assert "env=custom" in capsys.readouterr().err
+
+
+def test_the_run_of_a_checkpoint_is_found(training: FakeTraining) -> None:
+    train_main(["hydra.run.dir=mine"])
+    Path("mine/checkpoints").mkdir()
+    file = Path("mine/checkpoints/step_1.pt")
+    file.touch()
+    assert find_run(file, "resume") == find_run(file.parent, "resume") == find_run(Path("mine"), "resume")
+
+
+def test_versions_name_what_the_run_stands_on() -> None:
+    import numpy
+
+    versions = read_versions()
+    assert versions["numpy"] == numpy.__version__
+    assert versions["python"] == ".".join(map(str, sys.version_info[:3]))
+    for package in ("torch", "torchrl", "tensordict", "mujoco", "mlagents-envs", "hydra-core"):
+        assert versions[package]
+    root = Path(__file__).resolve().parents[1]
+    if (root / ".git").exists():
+        head = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True)
+        assert versions["git_commit"] == head.stdout.strip() and isinstance(versions["git_dirty"], bool)
+
+
+# --- evaluation
+
+
+def test_evaluation_prints_a_table_and_one_line_of_json(
+    training: FakeTraining, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls: list[tuple[Path, dict[str, Any]]] = []
+
+    def evaluate(run: Path, **options: Any) -> dict[str, Any]:
+        calls.append((run, options))
+        return {"return_mean": 99.5, "return_stderr": float("nan"), "3DBall": {"length_mean": 1000.0}}
+
+    module = ModuleType("mappo_unity.evaluate")
+    vars(module)["evaluate"] = evaluate
+    monkeypatch.setitem(sys.modules, "mappo_unity.evaluate", module)
+    train_main(["hydra.run.dir=mine"])
+    capsys.readouterr()
+    assert eval_main(["run=mine", "episodes=20", "deterministic=true"]) == 0
+    assert calls == [(Path("mine"), {"episodes": 20, "deterministic": True, "seed": 0})]
+    lines = capsys.readouterr().out.splitlines()
+    assert json.loads(lines[-1]) == {
+        "return_mean": 99.5,
+        "return_stderr": None,
+        "3DBall": {"length_mean": 1000.0},
+    }
+    assert any("return mean" in line and "99.5" in line for line in lines)
+    assert any("3DBall.length mean" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("lines", "word"),
+    [
+        ([], "run is not given"),
+        (["run=nowhere"], "run=nowhere does not exist"),
+        (["run=nowhere", "episodes=x"], "episodes=x does not fit: episodes must be a whole number"),
+        (["run=a", "episodes=0"], "episodes=0 is out of range"),
+        (["run=a", "episods=3"], "did you mean episodes"),
+    ],
+)
+def test_a_mistake_in_an_evaluation_is_told(
+    lines: list[str],
+    word: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert eval_main(lines) == 2
+    assert word in capsys.readouterr().err

@@ -1,0 +1,236 @@
+"""Options from the command line: composition, precedence, and what every mistake is told."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mappo_unity import compose, presets
+from mappo_unity.compose import check_factory, compose_config, compose_plain, compose_resumed, load_config
+from mappo_unity.config import Activation, Config, ConfigError, EvalConfig, LogBackend
+from mappo_unity.options import option_table
+from mappo_unity.presets import conf_dir
+from mappo_unity.runs import CONFIG, write_record
+
+FILES = sorted(path.relative_to(conf_dir()).as_posix() for path in conf_dir().rglob("*.yaml"))
+FACTORY = "env.factory=test_compose:make_nothing"
+
+
+def make_nothing(seed: int) -> None:
+    """Stand for a factory of the user's."""
+
+
+NOT_A_FUNCTION = 3
+
+
+@pytest.fixture
+def own_conf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Give a copy of conf/ that a test may add presets to."""
+    copy = tmp_path / "conf"
+    shutil.copytree(conf_dir(), copy)
+    monkeypatch.setattr(compose, "conf_dir", lambda: copy)
+    monkeypatch.setattr(presets, "conf_dir", lambda: copy)
+    presets.group_choices.cache_clear()
+    yield copy
+    presets.group_choices.cache_clear()
+
+
+def message_of(lines: list[str]) -> str:
+    with pytest.raises(ConfigError) as caught:
+        compose_config(lines)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_every_file_under_conf_composes(file: str) -> None:
+    group, _, name = file.removesuffix(".yaml").rpartition("/")
+    lines = [f"{group}={name}"] if group else []
+    if name == "custom":
+        lines.append(FACTORY)
+    config = compose_config(lines).config
+    assert isinstance(config, Config)
+    if group == "env":
+        assert config.env.name == name
+
+
+def test_later_sources_win(own_conf: Path) -> None:
+    head = "# @package _global_\n"
+    (own_conf / "env" / "Fast.yaml").write_text(
+        head + "env: {name: Fast}\nppo: {gamma: 0.91, epochs: 11, lr: 0.011}\n"
+    )
+    (own_conf / "recipe").mkdir(exist_ok=True)
+    (own_conf / "recipe" / "hot.yaml").write_text(head + "ppo: {epochs: 22, lr: 0.022}\n")
+    config = compose_config(["ppo.lr=0.033", "recipe=hot", "env=Fast"]).config
+    assert config.ppo.gae_lambda == Config().ppo.gae_lambda  # the dataclass
+    assert config.ppo.gamma == 0.91  # the env preset
+    assert config.ppo.epochs == 22  # the recipe
+    assert config.ppo.lr == 0.033  # the command line
+
+
+def test_values_arrive_with_their_types() -> None:
+    config = compose_config(
+        ["model.hidden=[32,16]", "model.activation=relu", "log.backends=[csv,wandb]", "stop_at_return=95"]
+    ).config
+    assert config.model.hidden == [32, 16]
+    assert config.model.activation is Activation.relu
+    assert config.log.backends == [LogBackend.csv, LogBackend.wandb]
+    assert config.stop_at_return == 95.0 and isinstance(config.stop_at_return, float)
+
+
+def test_env_params_take_new_names_without_a_plus() -> None:
+    config = compose_config(
+        ["env.params.mass=2", "env.params.wind={x: 1, y: [0.5]}", "+env.params.z=a"]
+    ).config
+    assert config.env.params == {"mass": 2, "wind": {"x": 1, "y": [0.5]}, "z": "a"}
+
+
+def test_run_folder_is_named_by_env_and_by_the_user() -> None:
+    assert compose_config(["output_dir=there"]).run_dir.parent == Path("there/3DBall")
+    assert compose_config(["hydra.run.dir=mine"]).run_dir == Path("mine")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("env=3Dball", ["env=3Dball", "does not exist", "did you mean 3DBall", "choices: 3DBall", "custom"]),
+        ("env=", ["env=", "does not exist", "choices: 3DBall"]),
+        ("sed=3", ["sed is not an option", "did you mean seed", "max_steps"]),
+        ("lr=1", ["lr is not an option", "did you mean ppo.lr"]),
+        ("ppo.gama=0.9", ["ppo.gama", "did you mean ppo.gamma", "ppo.clip_epsilon"]),
+        ("pppo.lr=1", ["pppo.lr is not an option", "did you mean ppo.lr", "ppo.*"]),
+        ("+extra=1", ["extra is not an option"]),
+        ("ppo={lrr: 1}", ["ppo.lrr is not an option", "did you mean ppo.lr"]),
+        ("ppo=3", ["ppo=3", "section", "ppo.lr"]),
+        ("~ppo.lr", ["ppo.lr cannot be deleted"]),
+        ("seed=abc", ["seed=abc", "a whole number"]),
+        ("seed=1.5", ["seed=1.5", "a whole number"]),
+        ("seed=null", ["seed=null", "a whole number"]),
+        ("max_steps=1e6", ["max_steps", "a whole number", "write 1000000"]),
+        ("ppo.lr=fast", ["ppo.lr=fast", "a number", "Learning rate"]),
+        ("stop_at_return=x", ["stop_at_return=x", "a number or null"]),
+        ("log.progress=7", ["log.progress=7", "true or false"]),
+        ("model.hidden=3", ["model.hidden=3", "a list of whole numbers", "[128,128]"]),
+        ("model.hidden=[a]", ["model.hidden=[a]", "a list of whole numbers"]),
+        ("model.activation=foo", ["model.activation=foo", "one of tanh, relu, silu, elu"]),
+        ("log.backends=[csv,tb]", ["log.backends=[csv,tb]", "any of csv, tensorboard, wandb, mlflow"]),
+        ("env.params=3", ["env.params=3", "named values"]),
+        ("ppo.gamma=2", ["ppo.gamma=2", "out of range", "from 0 to 1"]),
+        ("ppo.lr=nan", ["ppo.lr=nan", "must be > 0"]),
+        ("stop_at_return=inf", ["stop_at_return=inf", "finite"]),
+        ("model.hidden=[]", ["model.hidden=[]", "at least one width"]),
+        ("seed=-1", ["seed=-1", "from 0 to 2147483647"]),
+        ("device=tpu", ["device='tpu'", "cpu, cuda, cuda:N"]),
+        ("env.name=../up", ["env.name='../up'", "letters, digits"]),
+        ("env=custom", ["env.factory is not given", "package.module:function"]),
+        ("env.factory=a.b", ["env.factory='a.b'", "package.module:function"]),
+        ("seed", ["seed has no value", "seed=value"]),
+        ("a b=3", ["'a b=3'", "option=value"]),
+        ("--cfg", ["--cfg is not an option", "option=value", "--help"]),
+        ("ppo.lr=[1,", ["ppo.lr=[1,", "cannot be read", "in quotes"]),
+        ("seed=1,2", ["seed=1,2", "needs -m"]),
+        ("ppo.lr=${nothing}", ["ppo.lr", "nothing", "not found"]),
+        ("hydra/launcher=nope", ["hydra/launcher/nope", "joblib", "basic"]),
+        ("hydra.nope=1", ["hydra.nope"]),
+    ],
+)
+def test_a_mistake_is_told(line: str, words: list[str]) -> None:
+    message = message_of([line])
+    for word in words:
+        assert word in message
+    assert "Traceback" not in message and "full stack trace" not in message
+
+
+@pytest.mark.parametrize(
+    ("factory", "words"),
+    [
+        ("no_such_module:f", ["no_such_module cannot be imported", "No module named"]),
+        ("test_compose:make_nothin", ["has no make_nothin", "did you mean make_nothing"]),
+        ("test_compose:NOT_A_FUNCTION", ["is a int", "must be a function that returns a BaseEnv"]),
+    ],
+)
+def test_a_wrong_factory_is_told(factory: str, words: list[str]) -> None:
+    config = compose_config(["env=custom", f"env.factory={factory}"]).config
+    with pytest.raises(ConfigError) as caught:
+        check_factory(config)
+    for word in (f"env.factory={factory}", *words):
+        assert word in str(caught.value)
+
+
+def test_a_factory_of_the_working_directory_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_own_simulator.py").write_text("def make(seed):\n    pass\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))  # what is added goes afterwards
+    check_factory(compose_config(["env=custom", "env.factory=my_own_simulator:make"]).config)
+
+
+def test_a_missing_sweep_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mappo_unity import overrides
+
+    monkeypatch.setattr(overrides, "is_installed", lambda module: False)
+    for line, package in (
+        ("hydra/launcher=joblib", "hydra-joblib-launcher"),
+        ("hydra/sweeper=optuna", "hydra-optuna-sweeper"),
+    ):
+        message = message_of([line])
+        assert package in message and "mappo-unity[sweep]" in message
+
+
+def test_a_run_goes_on_with_its_own_options(tmp_path: Path) -> None:
+    lines = ["env.params.mass=2", "model.hidden=[8]", "max_steps=50", "log.backends=[csv]"]
+    config = compose_config(lines).config
+    write_record(tmp_path, config, lines)
+    assert load_config(tmp_path / CONFIG) == config
+    resumed = compose_resumed(
+        [f"resume={tmp_path}", "max_steps=70", "env=3DBall", "env.params.wind=1"], tmp_path / CONFIG
+    )
+    assert (resumed.max_steps, resumed.model.hidden) == (70, [8])
+    assert resumed.env.params == {"mass": 2, "wind": 1}
+    assert resumed.env.num_areas == config.env.num_areas
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("env=custom", ["env=custom", "env=3DBall"]),
+        ("env.name=Other", ["env.name cannot change with resume"]),
+        ("output_dir=x", ["output_dir cannot change with resume"]),
+        ("ppo.gamma=3", ["ppo.gamma=3", "from 0 to 1"]),
+        ("ppo.gama=1", ["did you mean ppo.gamma"]),
+    ],
+)
+def test_a_mistake_in_going_on_is_told(line: str, words: list[str], tmp_path: Path) -> None:
+    write_record(tmp_path, compose_config([]).config, [])
+    with pytest.raises(ConfigError) as caught:
+        compose_resumed([f"resume={tmp_path}", line], tmp_path / CONFIG)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_a_broken_config_file_of_a_run_is_told(tmp_path: Path) -> None:
+    for text in ("a: [", "- 1", "seed: x", "nonsense: 1"):
+        (tmp_path / CONFIG).write_text(text)
+        with pytest.raises(ConfigError, match=r"config\.yaml|seed|nonsense"):
+            load_config(tmp_path / CONFIG)
+
+
+def test_evaluation_options() -> None:
+    options = compose_plain(["run=there", "episodes=7", "deterministic=true"], EvalConfig)
+    assert (options.run, options.episodes, options.deterministic, options.seed) == ("there", 7, True, 0)
+    for lines, word in (
+        (["episodes=3"], "run is not given"),
+        (["run=x", "episodes=0"], "episodes=0 is out of range"),
+        (["run=x", "episode=3"], "did you mean episodes"),
+        (["run=x", "deterministic=2"], "true or false"),
+    ):
+        with pytest.raises(ConfigError, match=word):
+            compose_plain(lines, EvalConfig)
+
+
+@pytest.mark.parametrize("schema", [Config, EvalConfig])
+def test_every_option_is_described(schema: type) -> None:
+    undescribed = [key for key, option in option_table(schema).items() if not option.description]
+    assert undescribed == []

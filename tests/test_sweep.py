@@ -1,0 +1,182 @@
+"""Sweeps: one folder a job, a table, failures that stay alone, the plugins."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import fake_training
+import pytest
+
+from mappo_unity.cli import train_main
+from mappo_unity.config import ConfigError
+from mappo_unity.sweep import plan_jobs, run_sweep
+
+
+@pytest.fixture(autouse=True)
+def _training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "mappo_unity.train", fake_training)
+    monkeypatch.chdir(tmp_path)
+
+
+def only_sweep(name: str = "3DBall") -> Path:
+    (folder,) = Path("outputs/multirun", name).iterdir()
+    return folder
+
+
+def results(folder: Path) -> list[dict[str, str]]:
+    with (folder / "results.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_grid_runs_every_combination_and_ranks_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train_main(["-m", "seed=0,1", "ppo.lr=1e-4,3e-4", "env.params.mass=2"]) == 0
+    folder = only_sweep()
+    rows = results(folder)
+    assert [(row["seed"], row["ppo.lr"]) for row in rows] == [
+        ("1", "0.0001"),
+        ("1", "0.0003"),
+        ("0", "0.0001"),
+        ("0", "0.0003"),
+    ]
+    assert [float(row["return_mean"]) for row in rows] == pytest.approx([0.9, 0.7, -0.1, -0.3])
+    out = capsys.readouterr().out
+    assert "best first" in out and str(folder) in out
+    assert out.index("│   2 │ 1") < out.index("│   1 │ 0")
+    for number in range(4):
+        job = folder / str(number)
+        assert {"config.yaml", "overrides.yaml", "versions.json", "result.json"} <= {
+            p.name for p in job.iterdir()
+        }
+    assert json.loads((folder / "3" / "result.json").read_text()) == {
+        "job": 3,
+        "overrides": ["seed=1", "ppo.lr=0.0003", "env.params.mass=2"],
+        "status": "finished",
+        "return_mean": 0.7,
+        "agent_steps": 1_000_000,
+        "wall_s": 0.5,
+        "error": None,
+    }
+
+
+def test_a_failed_job_stops_no_other(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train_main(["-m", "seed=13,5"]) == 1
+    rows = results(only_sweep())
+    assert [(row["seed"], row["status"]) for row in rows] == [("5", "finished"), ("13", "failed")]
+    assert "unlucky" in rows[1]["error"]
+    assert "RuntimeError: unlucky" in capsys.readouterr().err
+    assert "unlucky" in (only_sweep() / "0" / "error.txt").read_text()
+
+
+def test_a_signal_ends_the_sweep(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train_main(["-m", "seed=0,15,2"]) == 143
+    status = {row["seed"]: row["status"] for row in results(only_sweep())}
+    assert status == {"0": "finished", "15": "interrupted", "2": "no result"}
+
+
+def test_sweeps_never_collide() -> None:
+    folders = [run_sweep(["seed=0,1"]).folder for _ in range(3)]
+    assert len(set(folders)) == 3
+    assert all(len(list(folder.glob("*/result.json"))) == 2 for folder in folders)
+
+
+def test_a_sweep_over_environments_has_one_folder() -> None:
+    lines = ["env=3DBall,custom", "env.factory=builtins:dict"]
+    assert run_sweep(lines).exit_code == 0
+    names = [(only_sweep("several") / str(job) / "config.yaml").read_text() for job in range(2)]
+    assert ["name: 3DBall" in names[0], "name: custom" in names[1]] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["seed=0,x"], ["seed=x", "a whole number"]),
+        (["seed=0,1", "ppo.gamma=0.9,7"], ["ppo.gamma=7", "from 0 to 1", "in the job seed=0 ppo.gamma=7"]),
+        (["env=3DBall,Nope"], ["env=Nope does not exist"]),
+        (["sed=1,2"], ["did you mean seed"]),
+        (["ppo.lr=interval(1e-4,1e-3)"], ["interval", "hydra/sweeper=optuna"]),
+        (["resume=x", "seed=1,2"], ["resume cannot be swept"]),
+        (["hydra/sweeper=optuna", "ppo.lr=interval(a,b)"], ["ppo.lr"]),
+        (["hydra/sweeper=optuna", "ppo.gamma=3"], ["ppo.gamma=3", "from 0 to 1"]),
+    ],
+)
+def test_wrong_options_start_no_job(
+    lines: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train_main(["-m", *lines]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and list(tmp_path.iterdir()) == []
+    for word in words:
+        assert word in captured.err
+
+
+def test_a_named_sweep_folder_is_never_overwritten() -> None:
+    lines = ["seed=0,1", "hydra.sweep.dir='my sweep'"]
+    assert run_sweep(lines).folder == Path("my sweep")
+    with pytest.raises(ConfigError, match="my sweep is not empty"):
+        run_sweep(lines)
+
+
+def test_planned_jobs_are_the_combinations() -> None:
+    assert plan_jobs(["seed=range(0,3)", "ppo.epochs=2"]) == [
+        [f"seed={seed}", "ppo.epochs=2"] for seed in range(3)
+    ]
+
+
+def test_optuna_searches_for_the_best_return(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    command = [
+        "hydra/sweeper=optuna",
+        "hydra.sweeper.n_trials=4",
+        "ppo.lr=interval(0.001,0.01)",
+        "ppo.gamma=0.9",
+    ]
+    assert train_main(["-m", *command]) == 0
+    rows = results(only_sweep())
+    rates = [float(row["ppo.lr"]) for row in rows]
+    assert len(rates) == 4 and rates == sorted(rates) and 0.001 <= rates[0] <= rates[-1] <= 0.01
+    assert {row["ppo.gamma"] for row in rows} == {"0.9"}
+    assert len({row["ppo.entropy_coef"] for row in rows}) == 4  # searched by the preset
+    text = (only_sweep() / "optimization_results.yaml").read_text()
+    assert rows[0]["ppo.lr"] in text  # the best is the one with the highest return
+
+
+def test_a_failed_trial_ends_no_search() -> None:
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    result = run_sweep(
+        ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=3", "hydra.sweeper.n_jobs=1", "seed=13"]
+    )
+    assert [job.status for job in result.jobs] == ["failed"] * 3
+    assert result.exit_code == 1
+
+
+def test_joblib_runs_jobs_in_processes_of_their_own(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    # Every process of this interpreter starts with the fake training in the place of the real one.
+    starter = "import sys, fake_training\nsys.modules['mappo_unity.train'] = fake_training\n"
+    (tmp_path / "start").mkdir()
+    (tmp_path / "start" / "sitecustomize.py").write_text(starter)
+    tests = Path(__file__).resolve().parent
+    paths = [str(tmp_path / "start"), str(tests), str(tests.parent)]
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; from mappo_unity.cli import train_main; sys.exit(train_main())"]
+        + ["-m", "hydra/launcher=joblib", "seed=0,1,13,5"],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+        timeout=120,
+    )
+    assert done.returncode == 1, done.stderr
+    assert "UserWarning" not in done.stderr
+    rows = results(only_sweep())
+    assert [(row["seed"], row["status"]) for row in rows] == [
+        ("5", "finished"),
+        ("1", "finished"),
+        ("0", "finished"),
+        ("13", "failed"),
+    ]
+    assert "unlucky" in done.stderr
