@@ -131,7 +131,9 @@ def run_job(tree: DictConfig) -> float | None:
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
     result = JobResult(int(hydra.job.num), [line.lstrip("+") for line in hydra.overrides.task], "failed")
-    print(f"job {result.job}: {' '.join(result.overrides)}", flush=True)
+    print(
+        f"job {result.job}: {' '.join(result.overrides)}\n", end="", flush=True
+    )  # one write: jobs print side by side
     start_s = time.monotonic()
     ended_by: int | None = None
     try:
@@ -182,7 +184,7 @@ def _quieten() -> None:
     """Keep the search's own log off the terminal: our table tells, and failed jobs tell themselves."""
     import optuna
 
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(logging.WARNING)
     logging.getLogger("hydra_plugins").setLevel(logging.ERROR)
 
 
