@@ -11,6 +11,7 @@ ML-Agents' exported policies.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -63,7 +64,7 @@ class ActionDistribution(Distribution):
         self.log_probs = [part.log_softmax(-1) for part in logits.split(list(layout.branches), -1)]
         super().__init__(params.shape[:-1], torch.Size([size + len(layout.branches)]), validate_args=False)
 
-    def sample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """Draw actions ``[*sample_shape, ..., C + K]``."""
         with torch.no_grad():
             if not self.layout.branches:
@@ -88,30 +89,30 @@ class ActionDistribution(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-probability ``[...]`` of actions ``[..., C + K]``, summed over columns."""
         size = self.layout.continuous
-        total = 0.0
+        total = torch.zeros(())
         if size:
             z = (value[..., :size] - self.loc) * torch.exp(-self.log_std)
             total = (-0.5 * z * z - self.log_std - _LOG_SQRT_2PI).sum(-1)
         for branch, log_probs in enumerate(self.log_probs):
             index = value[..., size + branch].long().unsqueeze(-1)
             total = total + log_probs.gather(-1, index).squeeze(-1)
-        return total  # type: ignore[return-value]
+        return total
 
     def entropy(self) -> Tensor:
         """Return the entropy ``[...]``, summed over columns and branches."""
-        total = 0.0
+        total = torch.zeros(())
         if self.layout.continuous:
             total = (self.log_std + 0.5 + _LOG_SQRT_2PI).sum(-1)
         for log_probs in self.log_probs:
             total = total - (log_probs.exp() * log_probs).sum(-1)
-        return total  # type: ignore[return-value]
+        return total
 
-    def _sample_continuous(self, sample_shape: torch.Size) -> Tensor:
+    def _sample_continuous(self, sample_shape: Sequence[int]) -> Tensor:
         shape = torch.Size(sample_shape) + self.loc.shape
         return self.loc + torch.exp(self.log_std) * torch.randn(shape, device=self.loc.device)
 
     @staticmethod
-    def _sample_branch(log_probs: Tensor, sample_shape: torch.Size) -> Tensor:
+    def _sample_branch(log_probs: Tensor, sample_shape: Sequence[int]) -> Tensor:
         shape = torch.Size(sample_shape) + log_probs.shape
         # Gumbel-max: argmax(log p + Gumbel noise) is a draw from p
         noise = -torch.empty(shape, device=log_probs.device).exponential_().log()

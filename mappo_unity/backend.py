@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Callable
+from typing import Any
 
 from mlagents_envs.base_env import BaseEnv
 
@@ -64,9 +65,13 @@ def _load_factory(path: str) -> Callable[..., Any]:
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
-        raise ConfigError(f"env.factory={path}: module {module_name!r} cannot be imported: {error}") from error
+        raise ConfigError(
+            f"env.factory={path}: module {module_name!r} cannot be imported: {error}"
+        ) from error
     function = getattr(module, function_name, None)
     if not callable(function):
         names = sorted(n for n, v in vars(module).items() if callable(v) and not n.startswith("_"))
-        raise ConfigError(f"env.factory={path}: {module_name} has no function {function_name!r}; it has {names}")
+        raise ConfigError(
+            f"env.factory={path}: {module_name} has no function {function_name!r}; it has {names}"
+        )
     return function

@@ -51,7 +51,8 @@ def save(path: Path, state: dict[str, Any]) -> None:
         temporary.unlink(missing_ok=True)
         raise CheckpointError(
             f"checkpoint {path} could not be written: {error}; the checkpoints before it stay as they are. "
-            "Free some space or choose another output_dir, then continue with resume=" + str(path.parent.parent)
+            "Free some space or choose another output_dir, then continue with resume="
+            + str(path.parent.parent)
         ) from error
 
 
@@ -90,13 +91,17 @@ def load(path: Path) -> dict[str, Any]:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
         if damaged is not None:
-            raise CheckpointError(f"checkpoint {path} is damaged: the checksum of its part {damaged!r} is wrong")
+            raise CheckpointError(
+                f"checkpoint {path} is damaged: the checksum of its part {damaged!r} is wrong"
+            )
         state = torch.load(path, map_location="cpu", weights_only=True)
     except CheckpointError:
         raise
     except Exception as error:  # zipfile, pickle and torch raise many kinds for damaged or hostile files
         reason = str(error).strip().split("\n")[0][:200] or type(error).__name__
-        raise CheckpointError(f"checkpoint {path} is damaged or no checkpoint of mappo-unity: {reason}") from error
+        raise CheckpointError(
+            f"checkpoint {path} is damaged or no checkpoint of mappo-unity: {reason}"
+        ) from error
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise CheckpointError(f"checkpoint {path} has another format than this version reads ({FORMAT})")
     return state
@@ -146,7 +151,10 @@ def _to_tensors(value: Any) -> Any:
 
 def _array_to_tensor(array: np.ndarray) -> Any:
     if array.dtype in (np.uint16, np.uint32, np.uint64):
-        return {"__array__": str(array.dtype), "data": torch.from_numpy(array.view(f"i{array.itemsize}").copy())}
+        return {
+            "__array__": str(array.dtype),
+            "data": torch.from_numpy(array.view(f"i{array.itemsize}").copy()),
+        }
     return torch.from_numpy(np.ascontiguousarray(array).copy())
 
 

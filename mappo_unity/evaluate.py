@@ -111,7 +111,10 @@ def _end_episodes(name: str, terminal: Any, running: dict, counts: _Counts) -> N
         if episode is None:
             continue
         counted, individual, group, length = episode
-        individual, group = individual + float(terminal.reward[row]), group + float(terminal.group_reward[row])
+        individual, group = (
+            individual + float(terminal.reward[row]),
+            group + float(terminal.group_reward[row]),
+        )
         if counted:
             ended = Episode(agent, individual, group, int(length), bool(terminal.interrupted[row]))
             counts.ended.setdefault(name, []).append(ended)
@@ -129,7 +132,9 @@ def _go_on(name: str, decision: Any, running: dict, counts: _Counts) -> None:
 
 def summarize(episodes: list[Episode]) -> dict[str, Any]:
     """Return the figures of episodes: returns with standard errors, length, share interrupted."""
-    individual, group = (np.array(x, float) for x in zip(*[(e.individual_return, e.group_return) for e in episodes]))
+    individual, group = (
+        np.array(x, float) for x in zip(*[(e.individual_return, e.group_return) for e in episodes])
+    )
     returns = individual + group
     out = {
         "episodes": len(episodes),

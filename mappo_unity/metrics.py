@@ -54,7 +54,10 @@ class EpisodeWindow:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that continuing needs."""
-        return {"total": self.total, "recent": {b: [list(r) for r in rows] for b, rows in self.recent.items()}}
+        return {
+            "total": self.total,
+            "recent": {b: [list(r) for r in rows] for b, rows in self.recent.items()},
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned."""

@@ -99,7 +99,9 @@ class Critic(nn.Module):
         return self.net(self.norm(obs))
 
 
-def make_mlp(size: int, hidden: list[int], outputs: int, activation: Activation, last_gain: float) -> nn.Sequential:
+def make_mlp(
+    size: int, hidden: list[int], outputs: int, activation: Activation, last_gain: float
+) -> nn.Sequential:
     """Build an MLP with orthogonal weights (hidden gain sqrt 2, last layer `last_gain`), zero biases."""
     layers: list[nn.Module] = []
     for width in hidden:
@@ -143,14 +145,14 @@ class JointPolicy(TensorDictModuleBase):
         super().__init__()
         self.actors = nn.ModuleDict({str(i): actor for i, actor in enumerate(actors.values())})
         self.names = list(actors)
-        self.in_keys = [(n, k) for n, actor in actors.items() for k in actor.in_keys]
+        self.in_keys = [(n, k) for n, actor in actors.items() for k in list(actor.in_keys)]
         self.out_keys = [(n, k) for n in actors for k in (keys.ACTION, keys.LOG_PROB)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write every name's action and log-probability beside its observation."""
         for name, actor in zip(self.names, self.actors.values()):
             entries = tensordict.get(name)
-            out = actor(entries.select(*actor.in_keys, strict=False))
+            out = actor(entries.select(*actor.in_keys, strict=False))  # type: ignore[misc]
             entries.set(keys.ACTION, out.get(keys.ACTION))
             entries.set(keys.LOG_PROB, out.get(keys.LOG_PROB))
         return tensordict

@@ -60,7 +60,9 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         self.log_ratio = out[0].detach()
         return out
 
-    def _critic_loss_inputs(self, target_return: Tensor, state_value: Tensor, old_state_value: Tensor | None) -> Any:
+    def _critic_loss_inputs(
+        self, target_return: Tensor, state_value: Tensor, old_state_value: Tensor | None
+    ) -> Any:
         delta = self.huber_delta
         old = None if old_state_value is None else old_state_value / delta
         return target_return / delta, state_value / delta, old
@@ -77,7 +79,12 @@ class PolicyLearner:
     """
 
     def __init__(
-        self, actor: ProbabilisticActor, critic: TensorDictModule, cfg: PPOConfig, max_rows: int, team_size: int
+        self,
+        actor: ProbabilisticActor,
+        critic: TensorDictModule,
+        cfg: PPOConfig,
+        max_rows: int,
+        team_size: int,
     ) -> None:
         self.actor, self.critic, self.cfg = actor, critic, cfg
         self.loss = MaskedClipPPOLoss(actor, critic, cfg)
@@ -143,9 +150,13 @@ class PolicyLearner:
             "value_mean": float(masked_mean(value, learns)),
         }
         self.value_norm.update(estimate.target[learns])
-        advantage = normalize(estimate.advantage, learns) if self.cfg.normalize_advantages else estimate.advantage
+        advantage = (
+            normalize(estimate.advantage, learns) if self.cfg.normalize_advantages else estimate.advantage
+        )
         entries = {
-            key: batch.get(key) for key in (keys.OBS, keys.ACTION, keys.LOG_PROB, keys.MASK) if key in batch.keys()
+            key: batch.get(key)
+            for key in (keys.OBS, keys.ACTION, keys.LOG_PROB, keys.MASK)
+            if key in batch.keys()
         }
         entries |= {keys.ADVANTAGE: advantage, keys.VALUE_TARGET: self.value_norm.normalize(estimate.target)}
         entries |= {LEARNS: learns, keys.VALUE: self.value_norm.normalize(value)}
@@ -188,7 +199,11 @@ class PolicyLearner:
             self._load_trainable(before)
             self.rollbacks += 1
         rolled = {"rolled_back": float(not healthy or kl_epoch > self.cfg.max_kl)}
-        return metrics | rolled | {"kl_last": kl_epoch, "kl_stopped": float(stopped), "rollbacks": float(self.rollbacks)}
+        return (
+            metrics
+            | rolled
+            | {"kl_last": kl_epoch, "kl_stopped": float(stopped), "rollbacks": float(self.rollbacks)}
+        )
 
     def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         losses = self.loss(minibatch)
@@ -235,7 +250,10 @@ class PolicyLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that continuing needs."""
-        return self._trainable_state() | {"value_norm": self.value_norm.state_dict(), "rollbacks": self.rollbacks}
+        return self._trainable_state() | {
+            "value_norm": self.value_norm.state_dict(),
+            "rollbacks": self.rollbacks,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned."""

@@ -142,7 +142,9 @@ class BehaviorRounds:
         ends = rows[~leaves]
         self.terminated[ends] = ~interrupted[~leaves]
         self.truncated[ends] = interrupted[~leaves]
-        self._terminal_obs.append((ends, [o[~leaves] for o in observations] if leaves.any() else observations))
+        self._terminal_obs.append(
+            (ends, [o[~leaves] for o in observations] if leaves.any() else observations)
+        )
 
     def _add_decision(self, decision: DecisionSteps) -> None:
         self._check(decision, "decision")
@@ -185,8 +187,8 @@ class BehaviorRounds:
 
     def _team_plays_on(self, rows: np.ndarray) -> np.ndarray:
         size = self.slots.team_size
-        alive = (self.present & ~self.departed).reshape(-1, size).any(1)
-        return alive[rows // size]
+        alive = (self.present & ~self.departed).reshape(-1, size).max(axis=1)
+        return np.asarray(alive)[rows // size]
 
     def _settle_departed(self, ends: np.ndarray, rows: np.ndarray, group_reward: np.ndarray) -> None:
         """Members that departed earlier earn what this end brought, and end with their team."""
@@ -211,7 +213,9 @@ class BehaviorRounds:
     def _check(self, steps: DecisionSteps | TerminalSteps, kind: str) -> None:
         for index, obs in enumerate(steps.obs):
             if not np.isfinite(obs).all():
-                self._refuse(steps, obs, f"sensor obs_{index} ({self.spec.observation_specs[index].name})", kind)
+                self._refuse(
+                    steps, obs, f"sensor obs_{index} ({self.spec.observation_specs[index].name})", kind
+                )
         for what, values in (("reward", steps.reward), ("group reward", steps.group_reward)):
             if not np.isfinite(values).all():
                 self._refuse(steps, values, what, kind)
@@ -226,7 +230,7 @@ class BehaviorRounds:
 
     def _check_mask(self, decision: DecisionSteps) -> None:
         for branch, forbidden in enumerate(decision.action_mask or []):
-            full = np.asarray(forbidden, bool).all(1)
+            full = np.atleast_1d(np.asarray(forbidden, bool).all(axis=1))
             if full.any():
                 agent = int(decision.agent_id[int(np.argmax(full))])
                 raise EnvironmentDataError(

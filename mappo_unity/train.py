@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from torchrl.collectors import Collector
 
 from mappo_unity import checkpoint
 from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
@@ -92,13 +93,13 @@ def make_learners(cfg: Config, env: UnityEnv) -> dict[str, PolicyLearner]:
         obs_size = sum(spec.shape[0] for spec in behavior.spec.observation_specs)
         actor = make_actor(obs_size, ActionLayout.from_spec(behavior.spec.action_spec), cfg.model)
         critic = make_critic(obs_size, cfg.model)
-        rows = cfg.collect.rounds * behavior.slots.num_teams * len(sides)
-        team_size = behavior.slots.team_size
+        teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
+        rows, agents = cfg.collect.rounds * teams, teams * team_size
         if cfg.ppo.minibatch_size > rows * team_size:
             raise ConfigError(
                 f"ppo.minibatch_size={cfg.ppo.minibatch_size} is larger than the batch of {name!r}: "
-                f"collect.rounds={cfg.collect.rounds} x {rows * team_size // cfg.collect.rounds} agents = "
-                f"{rows * team_size} decisions; lower ppo.minibatch_size or raise collect.rounds or env.num_areas"
+                f"collect.rounds={cfg.collect.rounds} x {agents} agents = {rows * team_size} decisions; "
+                "lower ppo.minibatch_size or raise collect.rounds or env.num_areas"
             )
         learners[name] = PolicyLearner(actor, critic, cfg.ppo, rows, team_size)
     return learners
@@ -129,7 +130,7 @@ class Trainer:
         """Iterate until the steps are done, the return is reached or a signal comes."""
         resume_steps = self.agent_steps if self.resumed else None
         self.log = RunLog(self.cfg.log, self.folder, self.cfg.max_steps, resume_steps)
-        collector = make_collector(transformed(self.env), self.policy, self.cfg.collect)
+        collector = self.make_collector()
         handlers = {s: signal.signal(s, self._on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
         rng_state = getattr(self, "_rng_state", None)
         if rng_state is not None:
@@ -156,6 +157,10 @@ class Trainer:
             self.last_checkpoint,
         )
 
+    def make_collector(self) -> Collector:
+        """Build the collector; it goes on where the environment stands."""
+        return make_collector(transformed(self.env), self.policy, self.cfg.collect)
+
     def iterate(self, batches: Any) -> None:
         """Collect a batch, learn from it, log, and save when it is time."""
         start = time.perf_counter()
@@ -175,13 +180,30 @@ class Trainer:
             "update_s": end - collected,
         }
         self._report(learned)
-        self._log_row({"episodes": self.window.total, "episodes_new": episodes} | self.window.summary() | times | learned)
+        self._log_row(
+            {"episodes": self.window.total, "episodes_new": episodes}
+            | self.window.summary()
+            | times
+            | learned
+        )
         if self.agent_steps - self.saved_at >= self.cfg.checkpoint_interval:
             self.save()
 
     def _learn(self, batch: TensorDictBase) -> dict[str, float]:
         progress = self.agent_steps / self.cfg.max_steps
-        return by_policy({n: l.learn(_entries(batch, n), progress) for n, l in self.learners.items()})
+        return by_policy(
+            {
+                name: learner.learn(self.entries(batch, name), progress)
+                for name, learner in self.learners.items()
+            }
+        )
+
+    @staticmethod
+    def entries(batch: TensorDictBase, name: str) -> TensorDictBase:
+        """Return one policy name's entries of a batch, with its own ``next``."""
+        entries = batch.get(name).copy()
+        entries.set("next", batch.get(("next", name)))
+        return entries
 
     def _log_row(self, row: dict[str, float]) -> None:
         if self.log is not None:
@@ -192,8 +214,9 @@ class Trainer:
         """Say it when an update was taken back."""
         if self.log is not None and learned.get("rolled_back"):
             self.log.message(
-                f"iteration {self.iteration}: the update was rolled back (approximate KL {learned['kl_last']:.3g}, "
-                f"limit ppo.max_kl={self.cfg.ppo.max_kl}); {learned['rollbacks']:.0f} so far"
+                f"iteration {self.iteration}: the update was rolled back (approximate KL "
+                f"{learned['kl_last']:.3g}, limit ppo.max_kl={self.cfg.ppo.max_kl}); "
+                f"{learned['rollbacks']:.0f} so far"
             )
 
     def _status(self) -> str | None:
@@ -289,7 +312,11 @@ def check_fits(path: Path, state: dict[str, Any], cfg: Config, layout: dict[str,
             f"checkpoint {path} was written for policies {state['layout']}, but the environment has {layout}"
         )
     model = plain(asdict(cfg.model))
-    different = [f"model.{k}={state['model'].get(k)} there, {v} here" for k, v in model.items() if state["model"].get(k) != v]
+    different = [
+        f"model.{k}={state['model'].get(k)} there, {v} here"
+        for k, v in model.items()
+        if state["model"].get(k) != v
+    ]
     if different:
         raise checkpoint.CheckpointError(f"checkpoint {path} holds another network: {'; '.join(different)}")
 
@@ -301,7 +328,13 @@ def get_rng_state() -> dict[str, Any]:
     return {
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "numpy": [str(kind), np.asarray(keys_).astype(np.int64), int(position), int(has_gauss), float(cached)],
+        "numpy": [
+            str(kind),
+            np.asarray(keys_).astype(np.int64),
+            int(position),
+            int(has_gauss),
+            float(cached),
+        ],
         "python": [int(version), list(internal), gauss_next],
     }
 
@@ -324,10 +357,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(entry) for entry in value]
     return getattr(value, "value", value)
-
-
-def _entries(batch: TensorDictBase, name: str) -> TensorDictBase:
-    """One policy name's entries of a batch, with its own ``next``."""
-    entries = batch.get(name).copy()
-    entries.set("next", batch.get(("next", name)))
-    return entries

@@ -53,7 +53,9 @@ def _concatenate(env: UnityEnv, policy: str, behavior: str) -> list[Transform]:
     vectors = [key for key, spec in zip(sensors, specs) if len(spec.shape) == 1]
     if len(vectors) < len(specs):
         shapes = [spec.shape for spec in specs]
-        raise ConfigError(f"policy {policy!r} has sensors of shapes {shapes}; only vector sensors can be learned yet")
+        raise ConfigError(
+            f"policy {policy!r} has sensors of shapes {shapes}; only vector sensors can be learned yet"
+        )
     return [
         CatTensors(in_keys=vectors, out_key=(policy, keys.OBS), dim=-1, sort=False, del_keys=False),
         ExcludeTransform(*sensors),

@@ -12,7 +12,8 @@ reset only hands out the first observation of the next episode; the scene itself
 
 from __future__ import annotations
 
-from typing import Any, Callable
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -90,7 +91,7 @@ class UnityEnv(EnvBase):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go back to a snapshot; the next full reset hands out its observations unchanged."""
-        self.base_env.set_state(state["scene"])  # type: ignore[attr-defined]
+        self.base_env.set_state(state["scene"])
         for name, behavior in self._behaviors.items():
             behavior.set_state(state["behaviors"][name])
         self._untouched = True
@@ -174,7 +175,9 @@ class UnityEnv(EnvBase):
             seen = sizes.get(policy, (1, 1))
             sizes[policy] = max(seen[0], teams), max(seen[1], members)
         for name in names:
-            teams, members = (limit or seen for limit, seen in zip(self._limits, sizes[keys.policy_name(name)]))
+            teams, members = (
+                limit or seen for limit, seen in zip(self._limits, sizes[keys.policy_name(name)])
+            )
             table = SlotTable(name, teams, members)
             behavior = BehaviorRounds(name, self.base_env.behavior_specs[name], table, self.death_masking)
             behavior.add(decisions[name], self.base_env.get_steps(name)[1])
@@ -239,14 +242,19 @@ class UnityEnv(EnvBase):
             for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED):
                 entries[key] = Binary(1, (*shape, 1), dtype=torch.bool)
             if behavior.mask.shape[1]:
-                entries[keys.MASK] = Binary(behavior.mask.shape[1], (*shape, behavior.mask.shape[1]), dtype=torch.bool)
+                entries[keys.MASK] = Binary(
+                    behavior.mask.shape[1], (*shape, behavior.mask.shape[1]), dtype=torch.bool
+                )
             observation[name] = Composite(entries, shape=shape)
             action[name] = Composite(
                 {keys.ACTION: _action_spec(behavior, shape, self.action_limit)}, shape=shape
             )
             rewards = {key: Unbounded((*shape, 1)) for key in (keys.REWARD, keys.GROUP_REWARD)}
             reward[name] = Composite(rewards, shape=shape)
-            ends = {key: Binary(1, (*shape, 1), dtype=torch.bool) for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
+            ends = {
+                key: Binary(1, (*shape, 1), dtype=torch.bool)
+                for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
+            }
             done[name] = Composite(ends, shape=shape)
         self.observation_spec = Composite(observation)
         self.action_spec = Composite(action)

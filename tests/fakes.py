@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Sequence
 
 import numpy as np
 from mlagents_envs.base_env import (
@@ -90,7 +90,9 @@ class ScriptedEnv(BaseEnv):
 
     def _columns(self, spec: BehaviorSpec, rows: list[Record]):
         obs = [
-            np.stack([np.full(o.shape, r.obs, np.float32) for r in rows]) if rows else np.zeros((0, *o.shape), np.float32)
+            np.stack([np.full(o.shape, r.obs, np.float32) for r in rows])
+            if rows
+            else np.zeros((0, *o.shape), np.float32)
             for o in spec.observation_specs
         ]
         ids = np.array([r.agent for r in rows], np.int32)

@@ -10,7 +10,19 @@ from mappo_unity.advantage import explained_variance, masked_gae, masked_mean, n
 from mappo_unity.config import Schedule
 
 
-def gae(reward, value, *, valued=None, final=0.0, final_valued=True, terminated=(), truncated=(), end=None, g=0.5, lam=1.0):
+def gae(
+    reward,
+    value,
+    *,
+    valued=None,
+    final=0.0,
+    final_valued=True,
+    terminated=(),
+    truncated=(),
+    end=None,
+    g=0.5,
+    lam=1.0,
+):
     count = len(reward)
     column = lambda rows: torch.tensor([t in rows for t in range(count)])  # noqa: E731
     valued = torch.ones(count, dtype=torch.bool) if valued is None else torch.tensor(valued)
@@ -29,7 +41,7 @@ def gae(reward, value, *, valued=None, final=0.0, final_valued=True, terminated=
 
 
 def test_by_hand_termination_interruption_and_bootstrap():
-    # gamma 0.5, lambda 1: returns 1 + .5*2 = 2 (end), then 4 + .5*8 = 8 (cut, bootstraps 8), then 1 + .5*6 = 4
+    # gamma .5, lambda 1: returns 1 + .5*2 = 2 (end), 4 + .5*8 = 8 (cut, bootstraps 8), 1 + .5*6 = 4
     out = gae([1, 2, 4, 1], [0.5] * 4, terminated=[1], truncated=[2], end=[0, 0, 8.0, 0], final=6)
     assert out.target.tolist() == [2.0, 2.0, 8.0, 4.0]
     assert out.advantage.tolist() == [1.5, 1.5, 7.5, 3.5]

@@ -13,7 +13,12 @@ import torch
 from mappo_unity import checkpoint
 from mappo_unity.checkpoint import CheckpointError, load, newest_good, save, save_in, to_arrays
 
-STATE = {"weights": {"a": torch.arange(1000.0)}, "count": 3, "rng": np.arange(5, dtype=np.uint64), "none": None}
+STATE = {
+    "weights": {"a": torch.arange(1000.0)},
+    "count": 3,
+    "rng": np.arange(5, dtype=np.uint64),
+    "none": None,
+}
 
 
 def test_what_is_saved_comes_back(tmp_path):

@@ -13,9 +13,10 @@ from mappo_unity.models import make_actor, make_critic
 from mappo_unity.ppo import LEARNS, PolicyLearner
 
 T, G, A, OBS = 12, 5, 2, 3
+TWO_CONTINUOUS = ActionLayout(2, ())
 
 
-def make_learner(layout=ActionLayout(2, ()), **options):
+def make_learner(layout=TWO_CONTINUOUS, **options):
     torch.manual_seed(0)
     model = ModelConfig(hidden=[16], activation=Activation.tanh)
     cfg = PPOConfig(**({"minibatch_size": 40} | options))
@@ -25,9 +26,14 @@ def make_learner(layout=ActionLayout(2, ()), **options):
 def make_batch(learner, acting=None):
     shape = (T, G, A)
     flags = torch.ones(*shape, 1, dtype=torch.bool)
-    batch = TensorDict({"observation": torch.randn(*shape, OBS) * 4 + 1, "acting": flags if acting is None else acting}, shape)
+    batch = TensorDict(
+        {"observation": torch.randn(*shape, OBS) * 4 + 1, "acting": flags if acting is None else acting},
+        shape,
+    )
     if learner.actor[0].module.layout.branches:
-        batch["action_mask"] = torch.ones(*shape, sum(learner.actor[0].module.layout.branches), dtype=torch.bool)
+        batch["action_mask"] = torch.ones(
+            *shape, sum(learner.actor[0].module.layout.branches), dtype=torch.bool
+        )
     with torch.no_grad():
         out = learner.actor(batch.clone())
     batch["action"], batch["action_log_prob"] = out["action"], out["action_log_prob"]
@@ -50,7 +56,7 @@ def make_batch(learner, acting=None):
 @pytest.mark.parametrize("layout", [ActionLayout(2, ()), ActionLayout(0, (3, 2)), ActionLayout(1, (4,))])
 def test_the_first_minibatch_has_ratio_one_and_kl_zero(layout):
     learner = make_learner(layout)
-    for round_number in range(3):  # after the normalisers have moved, too
+    for _ in range(3):  # after the normalisers have moved, too
         batch = make_batch(learner)
         rows, _ = learner._prepare(batch)
         learner.buffer.empty()
@@ -118,7 +124,12 @@ def test_target_kl_stops_the_epochs_early():
 
 def test_schedules_reach_the_optimizer_and_the_loss():
     learner = make_learner(
-        lr=1e-3, lr_final=1e-4, clip_schedule=Schedule.linear, clip_epsilon=0.3, entropy_coef=0.02, entropy_coef_final=0.01
+        lr=1e-3,
+        lr_final=1e-4,
+        clip_schedule=Schedule.linear,
+        clip_epsilon=0.3,
+        entropy_coef=0.02,
+        entropy_coef_final=0.01,
     )
     metrics = learner.learn(make_batch(learner), 0.5)
     assert metrics["lr"] == pytest.approx(5.5e-4)

@@ -14,7 +14,15 @@ import torch
 
 from mappo_unity import checkpoint
 from mappo_unity.checkpoint import CheckpointError
-from mappo_unity.config import CollectConfig, Config, ConfigError, EnvConfig, LogConfig, ModelConfig, PPOConfig
+from mappo_unity.config import (
+    CollectConfig,
+    Config,
+    ConfigError,
+    EnvConfig,
+    LogConfig,
+    ModelConfig,
+    PPOConfig,
+)
 from mappo_unity.train import Trainer, train
 
 TIMES = {"wall_s", "steps_per_s", "collect_s", "update_s"}
@@ -63,7 +71,9 @@ def assert_same(a, b, where="state"):
         for index, (x, y) in enumerate(zip(a, b)):
             assert_same(x, y, f"{where}[{index}]")
     elif isinstance(a, torch.Tensor):
-        assert torch.equal(a.nan_to_num(), b.nan_to_num()) if a.is_floating_point() else torch.equal(a, b), where
+        assert torch.equal(a.nan_to_num(), b.nan_to_num()) if a.is_floating_point() else torch.equal(a, b), (
+            where
+        )
     else:
         assert a == b or (a != a and b != b), where
 
@@ -133,12 +143,25 @@ def test_checkpoints_come_at_their_interval_and_rotate(tmp_path):
 
 
 def command(*arguments):
-    return [sys.executable, "-c", "from mappo_unity.cli import train_main; raise SystemExit(train_main())", *arguments]
+    return [
+        sys.executable,
+        "-c",
+        "from mappo_unity.cli import train_main; raise SystemExit(train_main())",
+        *arguments,
+    ]
 
 
 def start(folder, *arguments, **kwargs):
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(command(*arguments), cwd=folder, env=environment, text=True, stderr=subprocess.PIPE, stdout=subprocess.PIPE, **kwargs)
+    return subprocess.Popen(
+        command(*arguments),
+        cwd=folder,
+        env=environment,
+        text=True,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        **kwargs,
+    )
 
 
 def wait_for_rows(folder, count, process):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from fakes import Record as R
+from fakes import ScriptedEnv, behavior_spec
 from mlagents_envs.base_env import ActionSpec
-from tests.fakes import Record as R
-from tests.fakes import ScriptedEnv, behavior_spec
 from torchrl.envs.utils import check_env_specs
 
 from mappo_unity.config import ConfigError
@@ -26,7 +26,9 @@ def play(env, rounds, action=0.5):
     rows, td = [], env.reset()
     for _ in range(rounds):
         for name in td.keys():
-            td.set((name, "action"), torch.full_like(env.rand_action(td.copy()).get((name, "action")), action))
+            td.set(
+                (name, "action"), torch.full_like(env.rand_action(td.copy()).get((name, "action")), action)
+            )
         row, td = env.step_and_maybe_reset(td)
         rows.append(row)
     return torch.stack(rows), td
@@ -133,7 +135,10 @@ def test_a_member_that_dies_earns_its_teams_reward_until_the_team_ends():
         ]
     )
     rows, _ = play(env, 4)
-    dead = {key: rows["next", "Fake", key][:, 0, 0, 0].tolist() for key in ("reward", "group_reward", "terminated")}
+    dead = {
+        key: rows["next", "Fake", key][:, 0, 0, 0].tolist()
+        for key in ("reward", "group_reward", "terminated")
+    }
     assert dead["reward"] == [-0.5, 0, 0, 0]
     assert dead["group_reward"] == [0, 0.25, 1.0, 0]
     assert dead["terminated"] == [False, False, True, False]
@@ -217,7 +222,9 @@ def test_masks_turn_round_and_a_fully_masked_branch_names_the_agent():
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_numbers_that_are_not_finite_name_behavior_agent_and_sensor(bad):
     env, _ = open_env([[R(0), R(4)], [R(0), R(4, obs=bad)]])
-    with pytest.raises(EnvironmentDataError, match=r"'Fake\?team=0', agent 4: its sensor obs_0 \(vector\) holds (nan|inf)"):
+    with pytest.raises(
+        EnvironmentDataError, match=r"'Fake\?team=0', agent 4: its sensor obs_0 \(vector\) holds (nan|inf)"
+    ):
         play(env, 1)
     env, _ = open_env([[R(0)], [R(0, reward=bad)]])
     with pytest.raises(EnvironmentDataError, match="agent 0: its reward"):

@@ -1,0 +1,178 @@
+#!/usr/bin/env python3
+"""Measure 3DBall: collection, updates, time to a mean return of 95, memory - with ratios.
+
+Collection and updates are measured side by side with hand-written loops of the same networks and
+shapes (no TorchRL), in one process, in turns, so that the ratios hold on a machine that is shared.
+
+    python scripts/bench_3dball.py [--repeats 5] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+from mlagents_envs.base_env import ActionTuple
+from torch import nn
+
+from mappo_unity.compose import compose_config
+from mappo_unity.config import Config
+from mappo_unity.models import make_mlp
+from mappo_unity.scenes import make_scene
+from mappo_unity.train import Trainer
+
+
+def main() -> None:
+    """Run all measurements and print them."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    cfg = compose_config(
+        ["env=3DBall", f"seed={arguments.seed}", "log.backends=[]", "log.progress=false"]
+    ).config
+    print(
+        f"load average at the start: {os.getloadavg()[0]:.2f}; {os.cpu_count()} cores; "
+        f"torch threads {cfg.num_threads}; {cfg.env.num_areas} areas, {cfg.collect.rounds} rounds, "
+        f"hidden {list(cfg.model.hidden)}, minibatch {cfg.ppo.minibatch_size}"
+    )
+    time_to_95(cfg)
+    collection(cfg, arguments.repeats)
+    updates(cfg, arguments.repeats)
+    print(f"peak resident memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
+    print(f"load average at the end: {os.getloadavg()[0]:.2f}")
+
+
+def time_to_95(cfg: Config) -> None:
+    """Train until the mean return over a full window of finished episodes is 95."""
+    cfg = compose_config([f"seed={cfg.seed}", "log.progress=false", "stop_at_return=95"]).config
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = Trainer(cfg, Path(folder))
+        start = time.perf_counter()
+        outcome = trainer.run()
+        seconds = time.perf_counter() - start
+        trainer.close()
+    print(
+        f"mean return {outcome.return_mean:.1f} ({outcome.status}) after {seconds:.1f} s from the first "
+        f"environment step, {outcome.agent_steps:,} agent steps, {outcome.agent_steps / seconds:,.0f}/s"
+    )
+
+
+def collection(cfg: Config, repeats: int) -> None:
+    """Compare the collector with a bare loop: scene step and forward pass of the same network."""
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = Trainer(cfg, Path(folder))
+        batches = iter(trainer.make_collector())
+        bare = BareLoop(cfg)
+        next(batches), bare.collect(cfg.collect.rounds)
+        ours, theirs, ratios = [], [], []
+        for _ in range(repeats):
+            ours.append(timed(lambda: [next(batches) for _ in range(4)]))
+            theirs.append(timed(lambda: bare.collect(4 * cfg.collect.rounds)))
+            ratios.append(theirs[-1] / ours[-1])
+        steps = 4 * cfg.collect.rounds * int(cfg.env.num_areas or 12)
+        print(
+            f"collection: {steps / statistics.median(ours):,.0f} agent steps/s; bare loop "
+            f"{steps / statistics.median(theirs):,.0f}/s; ratio {statistics.median(ratios):.2f} "
+            f"({min(ratios):.2f} to {max(ratios):.2f})"
+        )
+        trainer.close()
+
+
+class BareLoop:
+    """Scene step and a plain forward pass with Gaussian noise, nothing else."""
+
+    def __init__(self, cfg: Config) -> None:
+        self.env = make_scene("3DBall", seed=cfg.seed, num_areas=cfg.env.num_areas)
+        self.net = make_mlp(8, list(cfg.model.hidden), 2, cfg.model.activation, 0.01)
+        self.env.reset()
+        self.name = next(iter(self.env.behavior_specs))
+
+    @torch.no_grad()
+    def collect(self, rounds: int) -> None:
+        """Play so many rounds in which agents decide."""
+        while rounds:
+            decision, _ = self.env.get_steps(self.name)
+            if len(decision):
+                mean = self.net(torch.from_numpy(decision.obs[0]))
+                action = (mean + torch.randn_like(mean)).clamp(-3, 3) / 3
+                self.env.set_actions(self.name, ActionTuple(continuous=action.numpy()))
+                rounds -= 1
+            self.env.step()
+
+
+def updates(cfg: Config, repeats: int) -> None:
+    """Compare the learner's epochs with a hand-written PPO update on the same rows."""
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = Trainer(cfg, Path(folder))
+        learner = next(iter(trainer.learners.values()))
+        batch = next(iter(trainer.make_collector()))
+        entries = trainer.entries(batch, next(iter(trainer.learners)))
+        rows, _ = learner._prepare(entries)
+        hand = HandWritten(cfg)
+        data = [
+            rows[key].flatten(0, 1)
+            for key in ("observation", "action", "action_log_prob", "advantage", "value_target")
+        ]
+        learner._update(rows), hand.update(data)
+        ours, theirs, ratios = [], [], []
+        for _ in range(repeats):
+            ours.append(timed(lambda: learner._update(rows)))
+            theirs.append(timed(lambda: hand.update(data)))
+            ratios.append(theirs[-1] / ours[-1])
+        print(
+            f"update of {len(rows)} rows, {cfg.ppo.epochs} epochs: {statistics.median(ours) * 1e3:.0f} ms; "
+            f"hand-written {statistics.median(theirs) * 1e3:.0f} ms; speed ratio "
+            f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
+        )
+        trainer.close()
+
+
+class HandWritten:
+    """A PPO update in plain PyTorch: the same networks, losses, clipping and optimizer."""
+
+    def __init__(self, cfg: Config) -> None:
+        self.cfg = cfg
+        hidden, activation = list(cfg.model.hidden), cfg.model.activation
+        self.actor = make_mlp(8, hidden, 2, activation, 0.01)
+        self.critic = make_mlp(8, hidden, 1, activation, 1.0)
+        self.log_std = nn.Parameter(torch.zeros(2))
+        self.params = [*self.actor.parameters(), *self.critic.parameters(), self.log_std]
+        self.optimizer = torch.optim.Adam(self.params, cfg.ppo.lr, eps=1e-5, fused=True)
+
+    def update(self, data: list[torch.Tensor]) -> None:
+        """Run the epochs over minibatches."""
+        for _ in range(self.cfg.ppo.epochs):
+            for index in torch.randperm(len(data[0])).split(self.cfg.ppo.minibatch_size):
+                obs, action, old, advantage, target = (x[index] for x in data)
+                dist = torch.distributions.Normal(self.actor(obs), self.log_std.exp(), validate_args=False)
+                ratio = (dist.log_prob(action).sum(-1) - old).exp()
+                gain = advantage.squeeze(-1)
+                clip = self.cfg.ppo.clip_epsilon
+                policy = -torch.minimum(ratio * gain, ratio.clamp(1 - clip, 1 + clip) * gain).mean()
+                value = nn.functional.huber_loss(self.critic(obs), target, delta=self.cfg.ppo.huber_delta)
+                entropy = dist.entropy().sum(-1).mean()
+                loss = policy + self.cfg.ppo.value_coef * value - self.cfg.ppo.entropy_coef * entropy
+                self.optimizer.zero_grad()
+                loss.backward()
+                nn.utils.clip_grad_norm_(self.params, self.cfg.ppo.max_grad_norm, foreach=True)
+                self.optimizer.step()
+
+
+def timed(work) -> float:  # type: ignore[no-untyped-def]
+    """Return the seconds that ``work()`` takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+if __name__ == "__main__":
+    main()
