@@ -318,7 +318,7 @@ class Scene(BaseEnv):
         self.agents.set_state(state["agents"])
         self._stacks.set_state(state["stacks"])
         self._queue.clear()
-        self._results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]  # type: ignore[misc]
+        self._results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]
         self._set_asked(state["asked"].copy())
         self._actions = {
             self._index[name]: ActionTuple(parts[0].copy(), parts[1].copy())

@@ -5,12 +5,12 @@ In: arrays of one event. Out: one `TerminalSteps` a behavior at an exchange. Kno
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from mlagents_envs.base_env import BehaviorSpec, DecisionSteps, TerminalSteps
 
-Steps = DecisionSteps | TerminalSteps
+Steps: TypeAlias = DecisionSteps | TerminalSteps
 
 
 class TerminalQueue:
