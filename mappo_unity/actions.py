@@ -25,20 +25,64 @@ _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 @dataclass(frozen=True)
 class ActionLayout:
-    """Sizes of an action: C continuous columns and the sizes of K discrete branches."""
+    """Sizes of an action: C continuous columns and the sizes of K discrete branches.
+
+    With ``joint`` there is one categorical over all combinations of the branches (27 for 3x3x3)
+    instead of one for each; the action itself still holds one index a branch.
+    """
 
     continuous: int
     branches: tuple[int, ...]
+    joint: bool = False
 
     @classmethod
-    def from_spec(cls, spec: ActionSpec) -> ActionLayout:
+    def from_spec(cls, spec: ActionSpec, joint: bool = False) -> ActionLayout:
         """Read the layout from a behavior's action spec."""
-        return cls(int(spec.continuous_size), tuple(int(n) for n in spec.discrete_branches))
+        branches = tuple(int(n) for n in spec.discrete_branches)
+        return cls(int(spec.continuous_size), branches, joint and len(branches) > 1)
+
+    @property
+    def categoricals(self) -> tuple[int, ...]:
+        """Sizes of the categoricals: the branches, or their product alone."""
+        return (math.prod(self.branches),) if self.joint else self.branches
+
+    @property
+    def num_logits(self) -> int:
+        """Number of logits."""
+        return sum(self.categoricals)
 
     @property
     def num_params(self) -> int:
         """Length P of the parameters: means, logarithms of deviations, logits."""
-        return 2 * self.continuous + sum(self.branches)
+        return 2 * self.continuous + self.num_logits
+
+    def to_categories(self, branches: Tensor) -> Tensor:
+        """Turn branch indices ``[..., K]`` into indices of the categoricals ``[..., K or 1]``."""
+        if not self.joint:
+            return branches
+        index = torch.zeros_like(branches[..., 0])
+        for column, size in enumerate(self.branches):
+            index = index * size + branches[..., column]
+        return index.unsqueeze(-1)
+
+    def to_branches(self, categories: Tensor) -> Tensor:
+        """Turn indices of the categoricals ``[..., K or 1]`` into branch indices ``[..., K]``."""
+        if not self.joint:
+            return categories
+        index, columns = categories[..., 0], []
+        for size in reversed(self.branches):
+            columns.append(index % size)
+            index = index // size
+        return torch.stack(columns[::-1], -1)
+
+    def joint_mask(self, mask: Tensor) -> Tensor:
+        """Turn masks of branches ``[..., sum]`` into masks of the categoricals."""
+        if not self.joint:
+            return mask
+        first, *rest = mask.split(list(self.branches), -1)
+        for part in rest:
+            first = (first.unsqueeze(-1) & part.unsqueeze(-2)).flatten(-2)
+        return first
 
 
 class ActionDistribution(Distribution):
@@ -60,8 +104,8 @@ class ActionDistribution(Distribution):
         self.log_std = params[..., size : 2 * size]
         logits = params[..., 2 * size :]
         if mask is not None and layout.branches:
-            logits = logits.masked_fill(~mask, torch.finfo(logits.dtype).min / 4)
-        self.log_probs = [part.log_softmax(-1) for part in logits.split(list(layout.branches), -1)]
+            logits = logits.masked_fill(~layout.joint_mask(mask), torch.finfo(logits.dtype).min / 4)
+        self.log_probs = [part.log_softmax(-1) for part in logits.split(list(layout.categoricals), -1)]
         super().__init__(params.shape[:-1], torch.Size([size + len(layout.branches)]), validate_args=False)
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
@@ -69,8 +113,8 @@ class ActionDistribution(Distribution):
         with torch.no_grad():
             if not self.layout.branches:
                 return self._sample_continuous(sample_shape)
-            branches = torch.stack([self._sample_branch(p, sample_shape) for p in self.log_probs], -1)
-            return self._join(self._sample_continuous(sample_shape), branches)
+            categories = torch.stack([self._sample_category(p, sample_shape) for p in self.log_probs], -1)
+            return self._join(self._sample_continuous(sample_shape), self.layout.to_branches(categories))
 
     rsample = sample
 
@@ -79,7 +123,8 @@ class ActionDistribution(Distribution):
         """The most likely action ``[..., C + K]``."""
         if not self.layout.branches:
             return self.loc
-        return self._join(self.loc, torch.stack([p.argmax(-1) for p in self.log_probs], -1))
+        categories = torch.stack([p.argmax(-1) for p in self.log_probs], -1)
+        return self._join(self.loc, self.layout.to_branches(categories))
 
     @property
     def deterministic_sample(self) -> Tensor:
@@ -93,9 +138,9 @@ class ActionDistribution(Distribution):
         if size:
             z = (value[..., :size] - self.loc) * torch.exp(-self.log_std)
             total = (-0.5 * z * z - self.log_std - _LOG_SQRT_2PI).sum(-1)
-        for branch, log_probs in enumerate(self.log_probs):
-            index = value[..., size + branch].long().unsqueeze(-1)
-            total = total + log_probs.gather(-1, index).squeeze(-1)
+        categories = self.layout.to_categories(value[..., size:].long())
+        for column, log_probs in enumerate(self.log_probs):
+            total = total + log_probs.gather(-1, categories[..., column : column + 1]).squeeze(-1)
         return total
 
     def entropy(self) -> Tensor:
@@ -112,7 +157,7 @@ class ActionDistribution(Distribution):
         return self.loc + torch.exp(self.log_std) * torch.randn(shape, device=self.loc.device)
 
     @staticmethod
-    def _sample_branch(log_probs: Tensor, sample_shape: Sequence[int]) -> Tensor:
+    def _sample_category(log_probs: Tensor, sample_shape: Sequence[int]) -> Tensor:
         shape = torch.Size(sample_shape) + log_probs.shape
         # Gumbel-max: argmax(log p + Gumbel noise) is a draw from p
         noise = -torch.empty(shape, device=log_probs.device).exponential_().log()

@@ -49,6 +49,23 @@ class Schedule(Enum):
     cosine = "cosine"
 
 
+class CriticKind(Enum):
+    """What the critic of an agent sees."""
+
+    local = "local"
+    central = "central"
+    mean = "mean"
+    attention = "attention"
+
+
+class ValueNormKind(Enum):
+    """How the critic's targets are normalised."""
+
+    none = "none"
+    running = "running"
+    popart = "popart"
+
+
 class ValueLoss(Enum):
     """Distance between the critic's output and its target."""
 
@@ -98,9 +115,7 @@ class EnvConfig:
                 "env.factory=package.module:function, a function that returns a BaseEnv"
             )
         if self.factory is not None and self.factory.count(":") != 1:
-            raise ConfigError(
-                f"env.factory={self.factory!r} is not of the form package.module:function"
-            )
+            raise ConfigError(f"env.factory={self.factory!r} is not of the form package.module:function")
 
 
 @dataclass
@@ -113,6 +128,13 @@ class ModelConfig:
     """Widths of the critic's hidden layers; null: as model.hidden."""
     activation: Activation = Activation.tanh
     """Nonlinearity between hidden layers."""
+    critic: CriticKind = CriticKind.central
+    """What an agent's critic sees: its own observation (local: IPPO), its team's concatenated (central:
+    MAPPO), or its team's pooled (mean, attention: for teams whose size varies)."""
+    share_parameters: bool = True
+    """One network for all members of a team; false: one for each member."""
+    flatten_branches: bool = False
+    """One categorical over all combinations of the discrete branches, instead of one for each branch."""
     normalize_obs: bool = True
     """Normalise observations by running mean and variance, inside the network."""
     init_log_std: float = 0.0
@@ -173,10 +195,17 @@ class PPOConfig:
     """Where the Huber loss turns linear, in units of the critic's (normalised) output."""
     clip_value: bool = False
     """Clip the move of the critic's output by the clipping interval."""
-    normalize_values: bool = True
-    """The critic learns returns normalised by running statistics."""
+    normalize_values: ValueNormKind = ValueNormKind.popart
+    """The critic learns returns normalised by running statistics; popart also rescales its last layer
+    when they move, so that its values stay what they were."""
     value_norm_beta: float = 0.99
     """Decay, for each batch, of the running statistics of returns."""
+    reward_weight: float = 1.0
+    """Weight of an agent's individual reward."""
+    group_reward_weight: float = 1.0
+    """Weight of its team's reward."""
+    death_masking: bool = True
+    """A member that ended while its team plays on keeps earning the team's reward until the team ends."""
     normalize_advantages: bool = True
     """Normalise advantages over the acting agents of a batch."""
     max_grad_norm: float = 0.5
@@ -221,9 +250,7 @@ class CollectConfig:
 class LogConfig:
     """Metrics and progress."""
 
-    backends: list[LogBackend] = field(
-        default_factory=lambda: [LogBackend.csv, LogBackend.tensorboard]
-    )
+    backends: list[LogBackend] = field(default_factory=lambda: [LogBackend.csv, LogBackend.tensorboard])
     """Any of csv, tensorboard, wandb, mlflow; metrics.csv is always written."""
     project: str = "mappo-unity"
     """Project (wandb) or experiment (mlflow) that the run is filed under."""
@@ -250,6 +277,9 @@ class Config:
     """Collecting experience."""
     log: LogConfig = field(default_factory=LogConfig)
     """Metrics and progress."""
+    behaviors: dict[str, Any] = field(default_factory=dict)
+    """Options of one behavior name: behaviors.Goalie.ppo.lr=1e-4 overrides ppo.lr for Goalie; sections
+    ppo and model."""
     seed: int = 0
     """Seed of the environment, the networks and the sampling."""
     max_steps: int = 1_000_000

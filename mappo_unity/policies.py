@@ -6,17 +6,18 @@ In: the records of a BaseEnv. Out: ActionTuples. Used to play, not to learn.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
-from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps
+from mlagents_envs.base_env import ActionSpec, ActionTuple, BehaviorSpec, DecisionSteps
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity import checkpoint, keys
 from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
-from mappo_unity.config import Activation, ConfigError, ModelConfig
+from mappo_unity.config import Activation, ConfigError, CriticKind, ModelConfig
+from mappo_unity.encoders import ObsLayout
 from mappo_unity.models import make_actor
 
 
@@ -59,21 +60,19 @@ class CheckpointPolicy:
         self.path, self.deterministic = path, deterministic
         self.agent_steps = int(state["agent_steps"])
         self.layout = state["layout"]
-        model = model_config(state["model"])
-        self.actors = {name: _actor(state, name, model) for name in self.layout}
+        self.actors = {name: _actor(state, name) for name in self.layout}
 
     @torch.no_grad()
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
         """Return an action for every row of ``steps``."""
         name = keys.policy_name(behavior)
         self.check(behavior, spec)
-        obs = torch.from_numpy(np.concatenate(steps.obs, 1).astype(np.float32))
-        entries = {keys.OBS: obs}
-        if steps.action_mask is not None:
-            entries[keys.MASK] = torch.from_numpy(~np.concatenate(steps.action_mask, 1).astype(bool))
+        places = team_places(steps.group_id, self.layout[name]["team_size"])
+        entries = {k: _spread(v, places) for k, v in _inputs(steps, spec).items()}
         kind = ExplorationType.DETERMINISTIC if self.deterministic else ExplorationType.RANDOM
         with set_exploration_type(kind):
-            chosen = self.actors[name](TensorDict(entries, [len(steps)])).get(keys.ACTION).numpy()
+            out = self.actors[name](TensorDict(entries, places.shape)).get(keys.ACTION)
+        chosen = out.numpy()[places.teams, places.members]
         size, action = spec.action_spec.continuous_size, ActionTuple()
         if size:
             scaled = np.clip(chosen[:, :size], -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT
@@ -86,7 +85,7 @@ class CheckpointPolicy:
         """Raise ConfigError if this policy cannot play that behavior."""
         name = keys.policy_name(behavior)
         known = self.layout.get(name)
-        found = describe_spec(spec)
+        found = describe_spec(spec, known["team_size"] if known else 1)
         if known != found:
             raise ConfigError(
                 f"checkpoint {self.path} cannot play {behavior!r}: it was trained for {self.layout}, "
@@ -94,25 +93,80 @@ class CheckpointPolicy:
             )
 
 
-def describe_spec(spec: BehaviorSpec) -> dict[str, Any]:
-    """Return what a network must fit: sensor shapes and actions."""
+class Places(NamedTuple):
+    """Where each row of a result stands among the teams."""
+
+    teams: np.ndarray  # int [n]
+    members: np.ndarray  # int [n]
+    shape: tuple[int, int]  # G, A
+
+
+def team_places(group_id: np.ndarray, team_size: int) -> Places:
+    """Give each row its team and its place in it: the order of the rows of a group.
+
+    Members that are not asked at the same time are not told apart by this; it matters only to
+    policies with a network for each member.
+    """
+    alone = np.arange(len(group_id)) + int(group_id.max(initial=0)) + 1
+    keys_ = np.where(group_id > 0, group_id, alone)
+    _, teams = np.unique(keys_, return_inverse=True)
+    order = np.argsort(teams, kind="stable")
+    starts = np.flatnonzero(np.r_[True, np.diff(teams[order]) > 0])
+    members = np.empty(len(teams), np.int64)
+    members[order] = np.arange(len(teams)) - np.repeat(starts, np.diff(np.r_[starts, len(teams)]))
+    if members.max(initial=0) >= team_size:
+        raise ConfigError(
+            f"a team of {members.max() + 1} agents is larger than the policy's {team_size} members"
+        )
+    return Places(teams, members, (int(teams.max(initial=-1)) + 1, team_size))
+
+
+def _inputs(steps: DecisionSteps, spec: BehaviorSpec) -> dict[str, np.ndarray]:
+    """The entries of a network's input, a row for each agent."""
+    shapes = [o.shape for o in spec.observation_specs]
+    entries = {keys.SENSOR.format(i): o for i, o in enumerate(steps.obs) if len(shapes[i]) == 3}
+    vectors = [o for o, shape in zip(steps.obs, shapes) if len(shape) == 1]
+    if vectors:
+        entries[keys.OBS] = np.concatenate(vectors, 1).astype(np.float32)
+    if spec.action_spec.discrete_size:
+        count, total = len(steps), sum(spec.action_spec.discrete_branches)
+        forbidden = np.concatenate(steps.action_mask, 1) if steps.action_mask else np.zeros((count, total))
+        entries[keys.MASK] = ~forbidden.astype(bool)
+    return entries
+
+
+def _spread(rows: np.ndarray, places: Places) -> torch.Tensor:
+    """Rows ``[n, ...]`` to ``[G, A, ...]``; empty places hold zeros, or True in masks."""
+    fill = np.ones if rows.dtype == bool else np.zeros
+    out = fill((*places.shape, *rows.shape[1:]), rows.dtype)
+    out[places.teams, places.members] = rows
+    return torch.from_numpy(out)
+
+
+def describe_spec(spec: BehaviorSpec, team_size: int) -> dict[str, Any]:
+    """Return what a network must fit: sensor shapes, actions, team size."""
     return {
+        "team_size": team_size,
         "sensors": [list(o.shape) for o in spec.observation_specs],
         "continuous": int(spec.action_spec.continuous_size),
         "branches": [int(n) for n in spec.action_spec.discrete_branches],
     }
 
 
-def model_config(saved: dict[str, Any]) -> ModelConfig:
-    """Return the model options that a checkpoint holds."""
-    options = dict(saved)
-    options["activation"] = Activation(options["activation"])
-    return ModelConfig(**options)
-
-
-def _actor(state: dict[str, Any], name: str, model: ModelConfig) -> Any:
-    layout = state["layout"][name]
-    actions = ActionLayout(layout["continuous"], tuple(layout["branches"]))
-    actor = make_actor(sum(shape[0] for shape in layout["sensors"]), actions, model)
+def _actor(state: dict[str, Any], name: str) -> Any:
+    layout, model = state["layout"][name], model_from_saved(state["model"][name])
+    actions = ActionLayout.from_spec(
+        ActionSpec(layout["continuous"], tuple(layout["branches"])), model.flatten_branches
+    )
+    actor = make_actor(ObsLayout.from_shapes(layout["sensors"]), actions, layout["team_size"], model)
     actor.load_state_dict(state["learners"][name]["actor"])
     return actor.eval()
+
+
+def model_from_saved(saved: dict[str, Any]) -> ModelConfig:
+    """Return the model options that a checkpoint holds."""
+    options = dict(saved) | {
+        "activation": Activation(saved["activation"]),
+        "critic": CriticKind(saved["critic"]),
+    }
+    return ModelConfig(**options)

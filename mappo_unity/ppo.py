@@ -23,11 +23,12 @@ from torchrl.objectives import ClipPPOLoss
 
 from mappo_unity import keys
 from mappo_unity.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
-from mappo_unity.config import Optimizer, PPOConfig, ValueLoss
-from mappo_unity.models import RunningNorm
+from mappo_unity.config import Optimizer, PPOConfig, ValueLoss, ValueNormKind
+from mappo_unity.encoders import RunningNorm
 from mappo_unity.value_norm import ValueNorm
 
 LEARNS = "learns"  # bool [rows, A, 1]: the slot acted and the outcome is known
+VALUED = "valued"  # bool [rows, A, 1]: the same, or its agent departed while a team mate acted
 
 
 class MaskedClipPPOLoss(ClipPPOLoss):
@@ -53,7 +54,17 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         self.log_explained_variance = False
         self.loss_mask_key = LEARNS
         self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
-        self.log_ratio = torch.zeros(())
+        self.log_ratio = self.entropy = torch.zeros(())
+
+    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Any:
+        entropy = super()._get_entropy(dist, adv_shape)
+        self.entropy = entropy.detach()
+        return entropy
+
+    def loss_critic(self, tensordict: TensorDictBase) -> Any:
+        """Return the critic's loss over all valued slots, in a shape that the mask of actions keeps."""
+        loss, *rest = super().loss_critic(tensordict)
+        return masked_mean(loss, tensordict.get(VALUED)).expand(loss.shape), *rest
 
     def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> Any:
         out = super()._log_weight(tensordict, adv_shape)
@@ -90,7 +101,11 @@ class PolicyLearner:
         self.loss = MaskedClipPPOLoss(actor, critic, cfg)
         self.params = [*actor.parameters(), *critic.parameters()]
         self.optimizer = make_optimizer(self.params, cfg)
-        self.value_norm = ValueNorm(cfg.value_norm_beta, cfg.normalize_values)
+        self.value_norm = ValueNorm(cfg.value_norm_beta, cfg.normalize_values is not ValueNormKind.none)
+        self.critic_keys = [str(key) for key in critic.in_keys]
+        self.value_layers = [m for m in critic.modules() if isinstance(m, nn.Linear) and m.out_features == 1]
+        inputs = [*(str(key) for key in actor.in_keys), *self.critic_keys]
+        self.row_keys = list(dict.fromkeys([*inputs, keys.ACTION, keys.LOG_PROB]))
         self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
         self.rollbacks = 0
         self.buffer = ReplayBuffer(
@@ -131,46 +146,63 @@ class PolicyLearner:
         """Add advantages and targets; return the team rows ``[R, A]`` in which anybody learns."""
         following = batch.get("next")
         acting, truncated = batch.get(keys.ACTING), following.get(keys.TRUNCATED)
-        value = self.value_norm.denormalize(self.critic(batch.select(keys.OBS)).get(keys.VALUE))
+        value = self._values(batch)
         estimate = masked_gae(
-            following.get(keys.REWARD) + following.get(keys.GROUP_REWARD),
+            self.cfg.reward_weight * following.get(keys.REWARD)
+            + self.cfg.group_reward_weight * following.get(keys.GROUP_REWARD),
             value,
             self._end_values(following, truncated),
-            self.value_norm.denormalize(self.critic(following[-1].select(keys.OBS)).get(keys.VALUE)),
-            acting,
-            following.get(keys.ACTING)[-1],
+            self._values(following[-1]),
+            valued(batch),
+            valued(following[-1]),
             following.get(keys.TERMINATED),
             truncated,
             gamma=self.cfg.gamma,
             gae_lambda=self.cfg.gae_lambda,
         )
-        learns = estimate.known
+        learns = estimate.known & acting
         metrics = {
             "explained_variance": float(explained_variance(value, estimate.target, learns)),
             "value_mean": float(masked_mean(value, learns)),
         }
-        self.value_norm.update(estimate.target[learns])
+        self._move_value_norm(estimate.target[estimate.known])
         advantage = (
             normalize(estimate.advantage, learns) if self.cfg.normalize_advantages else estimate.advantage
         )
-        entries = {
-            key: batch.get(key)
-            for key in (keys.OBS, keys.ACTION, keys.LOG_PROB, keys.MASK)
-            if key in batch.keys()
-        }
+        entries = {key: batch.get(key) for key in self.row_keys}
         entries |= {keys.ADVANTAGE: advantage, keys.VALUE_TARGET: self.value_norm.normalize(estimate.target)}
-        entries |= {LEARNS: learns, keys.VALUE: self.value_norm.normalize(value)}
+        entries |= {LEARNS: learns, VALUED: estimate.known, keys.VALUE: self.value_norm.normalize(value)}
         rows = TensorDict(entries, batch.batch_size).flatten(0, -2)
         used = learns.flatten(0, -3).any(-2).squeeze(-1)
         return (rows if bool(used.all()) else rows[used]), metrics
+
+    def _values(self, entries: TensorDictBase) -> Tensor:
+        """The critic's values in the reward's scale."""
+        out = self.critic(entries.select(*self.critic_keys))
+        return self.value_norm.denormalize(out.get(keys.VALUE))
+
+    def _move_value_norm(self, returns: Tensor) -> None:
+        """Take returns into the statistics; with PopArt the critic's values stay what they were.
+
+        PopArt (van Hasselt et al., arXiv 1602.07714, eq. 7): w' = w std / std',
+        b' = (std b + mean - mean') / std'.
+        """
+        mean, std = self.value_norm.statistics()
+        self.value_norm.update(returns)
+        if self.cfg.normalize_values is not ValueNormKind.popart:
+            return
+        new_mean, new_std = self.value_norm.statistics()
+        for layer in self.value_layers:
+            layer.weight.mul_(std / new_std)
+            layer.bias.mul_(std).add_(mean - new_mean).div_(new_std)
 
     def _end_values(self, following: TensorDictBase, truncated: Tensor) -> Tensor:
         """Values of terminal observations of cut episodes, 0 elsewhere."""
         out = torch.zeros(truncated.shape)
         where = truncated.flatten(0, -3).any(-2).squeeze(-1)
         if where.any():
-            rows = following.select(keys.OBS).flatten(0, -2)[where]
-            out.flatten(0, -3)[where] = self.value_norm.denormalize(self.critic(rows).get(keys.VALUE))
+            rows = following.select(*self.critic_keys).flatten(0, -2)[where]
+            out.flatten(0, -3)[where] = self._values(rows)
         return out
 
     def _update(self, rows: TensorDictBase) -> dict[str, float]:
@@ -220,7 +252,7 @@ class PolicyLearner:
         return {
             "policy_loss": losses["loss_objective"].detach(),
             "value_loss": losses["loss_critic"].detach(),
-            "entropy": losses["entropy"].detach(),
+            "entropy": masked_mean(self.loss.entropy.view(mask.shape), mask),
             "kl": kl,
             "clip_fraction": clipped,
             "grad_norm": grad_norm.detach(),
@@ -229,9 +261,10 @@ class PolicyLearner:
     @torch.no_grad()
     def _update_norms(self, batch: TensorDictBase) -> None:
         """Take the batch's observations into the normalisers, after the update that must not see it."""
-        rows = batch.get(keys.OBS)[batch.get(keys.ACTING).squeeze(-1)]
-        for norm in self.norms:
-            norm.update(rows)
+        if self.norms:
+            rows = batch.get(keys.OBS)[batch.get(keys.ACTING).squeeze(-1)]
+            for norm in self.norms:
+                norm.update(rows)
 
     def _weights_finite(self) -> bool:
         return all(bool(torch.isfinite(p).all()) for p in self.params)
@@ -260,6 +293,12 @@ class PolicyLearner:
         self._load_trainable(state)
         self.value_norm.load_state_dict(state["value_norm"])
         self.rollbacks = int(state["rollbacks"])
+
+
+def valued(entries: TensorDictBase) -> Tensor:
+    """Return which slots a value counts for: those that act, and departed ones while a team mate acts."""
+    acting = entries.get(keys.ACTING)
+    return acting | (entries.get(keys.DEPARTED) & acting.any(-2, keepdim=True))
 
 
 def make_optimizer(params: list[nn.Parameter], cfg: PPOConfig) -> torch.optim.Optimizer:

@@ -24,9 +24,11 @@ from torchrl.collectors import Collector
 from mappo_unity import checkpoint
 from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.backend import make_env_function
+from mappo_unity.behavior_options import check_behaviors, options_of
 from mappo_unity.collect import make_collector
 from mappo_unity.config import Config, ConfigError
-from mappo_unity.log import RunLog
+from mappo_unity.encoders import ObsLayout
+from mappo_unity.log import RunLog, check_backends
 from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
 from mappo_unity.models import JointPolicy, make_actor, make_critic
 from mappo_unity.policies import describe_spec
@@ -82,26 +84,30 @@ def make_unity_env(cfg: Config) -> UnityEnv:
         action_limit=CONTINUOUS_LIMIT,
         max_team_size=cfg.env.max_team_size,
         max_teams=cfg.env.max_teams,
+        death_masking=cfg.ppo.death_masking,
     )
 
 
 def make_learners(cfg: Config, env: UnityEnv) -> dict[str, PolicyLearner]:
     """Build networks and learner of every policy name."""
+    check_behaviors(cfg, env.sides)
     learners = {}
     for name, sides in env.sides.items():
+        model, ppo = options_of(cfg, name)
         behavior = env.behaviors[sides[0]]
-        obs_size = sum(spec.shape[0] for spec in behavior.spec.observation_specs)
-        actor = make_actor(obs_size, ActionLayout.from_spec(behavior.spec.action_spec), cfg.model)
-        critic = make_critic(obs_size, cfg.model)
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
         rows, agents = cfg.collect.rounds * teams, teams * team_size
-        if cfg.ppo.minibatch_size > rows * team_size:
+        if ppo.minibatch_size > rows * team_size:
             raise ConfigError(
-                f"ppo.minibatch_size={cfg.ppo.minibatch_size} is larger than the batch of {name!r}: "
+                f"ppo.minibatch_size={ppo.minibatch_size} is larger than the batch of {name!r}: "
                 f"collect.rounds={cfg.collect.rounds} x {agents} agents = {rows * team_size} decisions; "
                 "lower ppo.minibatch_size or raise collect.rounds or env.num_areas"
             )
-        learners[name] = PolicyLearner(actor, critic, cfg.ppo, rows, team_size)
+        obs = ObsLayout.from_specs(behavior.spec.observation_specs)
+        layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
+        actor = make_actor(obs, layout, team_size, model).to(cfg.device)
+        critic = make_critic(obs, team_size, model).to(cfg.device)
+        learners[name] = PolicyLearner(actor, critic, ppo, rows, team_size)
     return learners
 
 
@@ -110,6 +116,7 @@ class Trainer:
 
     def __init__(self, cfg: Config, folder: Path) -> None:
         prepare_torch(cfg)
+        check_backends(cfg.log)
         self.cfg, self.folder = cfg, folder
         self.env = make_unity_env(cfg)
         self.learners = make_learners(cfg, self.env)
@@ -255,7 +262,7 @@ class Trainer:
         """Return everything that continuing needs, between two iterations."""
         return {
             "env_name": self.cfg.env.name,
-            "model": plain(asdict(self.cfg.model)),
+            "model": self._models(),
             "layout": self._layout(),
             "learners": {name: learner.state_dict() for name, learner in self.learners.items()},
             "env": self.env.get_state(),
@@ -273,7 +280,7 @@ class Trainer:
             CheckpointError: it belongs to another environment or another network.
         """
         state = checkpoint.load(path)
-        check_fits(path, state, self.cfg, self._layout())
+        check_fits(path, state, self.cfg.env.name, self._layout(), self._models())
         for name, learner in self.learners.items():
             learner.load_state_dict(state["learners"][name])
         if state["env"] is not None:
@@ -288,6 +295,9 @@ class Trainer:
     def _layout(self) -> dict[str, Any]:
         return describe_policies(self.env)
 
+    def _models(self) -> dict[str, Any]:
+        return {name: plain(asdict(options_of(self.cfg, name)[0])) for name in self.learners}
+
     def close(self) -> None:
         """Close the environment and the logs."""
         if self.log is not None:
@@ -297,26 +307,32 @@ class Trainer:
 
 
 def describe_policies(env: UnityEnv) -> dict[str, Any]:
-    """Return what a network must fit: sensors and actions of every policy name."""
-    return {name: describe_spec(env.behaviors[sides[0]].spec) for name, sides in env.sides.items()}
+    """Return what a network must fit: sensors, actions and team size of every policy name."""
+    out = {}
+    for name, sides in env.sides.items():
+        behavior = env.behaviors[sides[0]]
+        out[name] = describe_spec(behavior.spec, behavior.slots.team_size)
+    return out
 
 
-def check_fits(path: Path, state: dict[str, Any], cfg: Config, layout: dict[str, Any]) -> None:
+def check_fits(
+    path: Path, state: dict[str, Any], env_name: str, layout: dict[str, Any], models: dict[str, Any]
+) -> None:
     """Refuse a checkpoint of another environment or network, saying what differs."""
-    if state["env_name"] != cfg.env.name:
+    if state["env_name"] != env_name:
         raise checkpoint.CheckpointError(
-            f"checkpoint {path} was written for env={state['env_name']}, not for env={cfg.env.name}"
+            f"checkpoint {path} was written for env={state['env_name']}, not for env={env_name}"
         )
     if state["layout"] != layout:
         raise checkpoint.CheckpointError(
             f"checkpoint {path} was written for policies {state['layout']}, but the environment has {layout}"
         )
-    model = plain(asdict(cfg.model))
-    different = [
-        f"model.{k}={state['model'].get(k)} there, {v} here"
-        for k, v in model.items()
-        if state["model"].get(k) != v
-    ]
+    different = []
+    for name, model in models.items():
+        saved = state["model"][name]
+        different += [
+            f"model.{k}={saved.get(k)} there, {v} here" for k, v in model.items() if saved.get(k) != v
+        ]
     if different:
         raise checkpoint.CheckpointError(f"checkpoint {path} holds another network: {'; '.join(different)}")
 

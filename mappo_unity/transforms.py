@@ -17,7 +17,7 @@ def make_transforms(env: UnityEnv) -> Compose:
     """Return the transforms of an environment.
 
     Raises:
-        ConfigError: two sides of one name differ in sensors or actions, or a policy has no vector sensor.
+        ConfigError: two sides of one name differ in sensors or actions.
     """
     transforms: list[Transform] = []
     for policy, sides in env.sides.items():
@@ -49,14 +49,10 @@ def _stack_sides(env: UnityEnv, policy: str, sides: list[str]) -> list[Transform
 
 def _concatenate(env: UnityEnv, policy: str, behavior: str) -> list[Transform]:
     specs = env.behaviors[behavior].spec.observation_specs
-    sensors = [(policy, keys.SENSOR.format(i)) for i, spec in enumerate(specs)]
-    vectors = [key for key, spec in zip(sensors, specs) if len(spec.shape) == 1]
-    if len(vectors) < len(specs):
-        shapes = [spec.shape for spec in specs]
-        raise ConfigError(
-            f"policy {policy!r} has sensors of shapes {shapes}; only vector sensors can be learned yet"
-        )
+    vectors = [(policy, keys.SENSOR.format(i)) for i, spec in enumerate(specs) if len(spec.shape) == 1]
+    if not vectors:
+        return []
     return [
         CatTensors(in_keys=vectors, out_key=(policy, keys.OBS), dim=-1, sort=False, del_keys=False),
-        ExcludeTransform(*sensors),
+        ExcludeTransform(*vectors),
     ]

@@ -23,7 +23,7 @@ from torch import nn
 
 from mappo_unity.compose import compose_config
 from mappo_unity.config import Config
-from mappo_unity.models import make_mlp
+from mappo_unity.layers import make_mlp
 from mappo_unity.scenes import make_scene
 from mappo_unity.train import Trainer
 

@@ -8,7 +8,8 @@ from torch.distributions import Categorical, Normal
 
 from mappo_unity.actions import ActionDistribution, ActionLayout
 from mappo_unity.config import ModelConfig
-from mappo_unity.models import Actor, RunningNorm, make_actor
+from mappo_unity.encoders import ObsLayout, RunningNorm
+from mappo_unity.models import Actor, make_actor
 from mappo_unity.value_norm import ValueNorm
 
 
@@ -74,7 +75,7 @@ def test_value_norm_is_debiased_and_inverts():
 
 
 def test_the_first_actions_are_near_the_middle_and_spread_by_init_log_std():
-    actor = Actor(4, ActionLayout(2, ()), ModelConfig(init_log_std=-0.5))
+    actor = Actor(ObsLayout(4), ActionLayout(2, ()), ModelConfig(init_log_std=-0.5))
     params = actor(torch.randn(100, 4))
     assert params[:, :2].abs().max() < 0.2
     assert params[:, 2:].unique().item() == pytest.approx(-0.5)
@@ -83,7 +84,7 @@ def test_the_first_actions_are_near_the_middle_and_spread_by_init_log_std():
 def test_actor_writes_action_and_log_prob():
     from tensordict import TensorDict
 
-    actor = make_actor(4, ActionLayout(0, (3, 3)), ModelConfig())
+    actor = make_actor(ObsLayout(4), ActionLayout(0, (3, 3)), 2, ModelConfig())
     mask = torch.ones(7, 2, 6, dtype=torch.bool)
     out = actor(TensorDict({"observation": torch.randn(7, 2, 4), "action_mask": mask}, [7, 2]))
     assert out["action"].shape == (7, 2, 2)

@@ -8,7 +8,8 @@ import torch
 from tensordict import TensorDict
 
 from mappo_unity.actions import ActionLayout
-from mappo_unity.config import Activation, ModelConfig, PPOConfig, Schedule, ValueLoss
+from mappo_unity.config import Activation, ModelConfig, PPOConfig, Schedule, ValueLoss, ValueNormKind
+from mappo_unity.encoders import ObsLayout
 from mappo_unity.models import make_actor, make_critic
 from mappo_unity.ppo import LEARNS, PolicyLearner
 
@@ -20,7 +21,8 @@ def make_learner(layout=TWO_CONTINUOUS, **options):
     torch.manual_seed(0)
     model = ModelConfig(hidden=[16], activation=Activation.tanh)
     cfg = PPOConfig(**({"minibatch_size": 40} | options))
-    return PolicyLearner(make_actor(OBS, layout, model), make_critic(OBS, model), cfg, T * G, A)
+    obs = ObsLayout(OBS)
+    return PolicyLearner(make_actor(obs, layout, A, model), make_critic(obs, A, model), cfg, T * G, A)
 
 
 def make_batch(learner, acting=None):
@@ -38,10 +40,13 @@ def make_batch(learner, acting=None):
         out = learner.actor(batch.clone())
     batch["action"], batch["action_log_prob"] = out["action"], out["action_log_prob"]
     none = torch.zeros(*shape, 1, dtype=torch.bool)
+    batch["present"], batch["departed"] = ~none, none
     batch["next"] = TensorDict(
         {
             "observation": torch.randn(*shape, OBS),
             "acting": batch["acting"].roll(-1, 0),
+            "present": ~none,
+            "departed": none,
             "reward": torch.randn(*shape, 1),
             "group_reward": torch.zeros(*shape, 1),
             "terminated": torch.rand(*shape, 1) < 0.05,
@@ -95,7 +100,8 @@ def test_rows_in_which_nobody_acted_carry_no_loss():
 
 
 def test_an_update_that_turns_nan_is_taken_back_and_counted():
-    learner = make_learner()
+    # (PopArt rescales the last layer before the update begins; that is not part of the update)
+    learner = make_learner(normalize_values=ValueNormKind.running)
     before = copy.deepcopy(learner._trainable_state())
     batch = make_batch(learner)
     batch["action_log_prob"][3, 2, 1] = math.nan
@@ -158,3 +164,31 @@ def test_state_goes_on_to_the_bit():
     for a, b in zip(one.params, two.params):
         assert torch.equal(a, b)
     assert one.value_norm.statistics() == two.value_norm.statistics()
+
+
+def test_popart_moves_the_statistics_and_leaves_the_values():
+    learner = make_learner(normalize_values=ValueNormKind.popart)
+    batch = make_batch(learner)
+    learner._move_value_norm(torch.randn(100) * 5 + 30)
+    before = learner._values(batch)
+    learner._move_value_norm(torch.randn(100) * 50 - 300)
+    after = learner._values(batch)
+    assert learner.value_norm.statistics()[0] < -100
+    assert torch.allclose(before, after, rtol=1e-4, atol=1e-2)
+
+
+def test_departed_members_train_the_critic_and_not_the_policy():
+    learner = make_learner(death_masking=True)
+    acting = torch.ones(T, G, A, 1, dtype=torch.bool)
+    acting[:, :, 1] = False
+    batch = make_batch(learner, acting)
+    batch["departed"] = batch["next", "departed"] = ~acting
+    rows, _ = learner._prepare(batch)
+    assert rows["learns"][:, 1].sum() == 0
+    assert rows["valued"][:, 1].sum() == rows["valued"][:, 0].sum() > 0
+    one, two = copy.deepcopy(learner), copy.deepcopy(learner)
+    other = rows.clone()
+    other["value_target"][:, 1] += 5.0
+    first, second = one._step(rows), two._step(other)
+    assert first["policy_loss"] == second["policy_loss"]
+    assert first["value_loss"] < second["value_loss"]

@@ -1,0 +1,74 @@
+"""Options of one behavior name: the sections ppo and model, with its own overrides on top.
+
+In: `Config`, a policy name. Out: its `ModelConfig` and `PPOConfig`, checked like the others.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import fields
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mappo_unity.config import Config, ConfigError, ModelConfig, PPOConfig
+
+SECTIONS = ("model", "ppo")
+
+
+def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:
+    """Check that every behavior named in the options exists and names only options that exist.
+
+    Raises:
+        ConfigError: naming those that the environment has.
+    """
+    known = list(policies)
+    for name in cfg.behaviors:
+        if name not in known:
+            raise ConfigError(
+                f"behaviors.{name}: the environment has no behavior {name!r}; it has {', '.join(known)}"
+            )
+        options_of(cfg, name)
+
+
+def options_of(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
+    """Return the model and learner options of a policy name.
+
+    Raises:
+        ConfigError: an override names no option, or its value has the wrong type or range.
+    """
+    own = cfg.behaviors.get(policy) or {}
+    where = f"behaviors.{policy}"
+    if not isinstance(own, dict):
+        raise ConfigError(f"{where}={own!r} must hold sections, for example {where}.ppo.lr=1e-4")
+    for section in own:
+        if section not in SECTIONS:
+            raise ConfigError(
+                f"{where}.{section}: only the sections {' and '.join(SECTIONS)} can differ by behavior"
+            )
+    model = _merged(cfg.model, own.get("model"), f"{where}.model")
+    ppo = _merged(cfg.ppo, own.get("ppo"), f"{where}.ppo")
+    return model, ppo
+
+
+def _merged(section: Any, own: Any, where: str) -> Any:
+    if not own:
+        return section
+    if not isinstance(own, dict):
+        raise ConfigError(f"{where}={own!r} must hold options, for example {where}.lr=1e-4")
+    names = [field.name for field in fields(section)]
+    for name in own:
+        if name not in names:
+            close = difflib.get_close_matches(str(name), names, 3)
+            hint = f"; did you mean {' or '.join(close)}?" if close else f"; there are {', '.join(names)}"
+            raise ConfigError(f"{where}.{name}: there is no such option{hint}")
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(section), own)
+        assert isinstance(merged, DictConfig)
+        return OmegaConf.to_object(merged)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{where}: {str(error).splitlines()[0]}") from error
