@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 SCENES = {
     "3DBall": "ball3d:Ball3D",
+    "Basic": "basic:Basic",
 }
 """Module and class of every scene, below this package."""
 
