@@ -176,11 +176,13 @@ class PolicyLearner:
         used = learns.flatten(0, -3).any(-2).squeeze(-1)
         return (rows if bool(used.all()) else rows[used]), metrics
 
+    @torch.no_grad()
     def _values(self, entries: TensorDictBase) -> Tensor:
         """The critic's values in the reward's scale."""
         out = self.critic(entries.select(*self.critic_keys))
         return self.value_norm.denormalize(out.get(keys.VALUE))
 
+    @torch.no_grad()
     def _move_value_norm(self, returns: Tensor) -> None:
         """Take returns into the statistics; with PopArt the critic's values stay what they were.
 
