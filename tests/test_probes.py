@@ -1,0 +1,166 @@
+"""Probe environments: a run of seconds must find the known answer."""
+
+import numpy as np
+import pytest
+import torch
+from probes import PROBES
+
+from mappo_unity.config import (
+    Backend,
+    CollectConfig,
+    Config,
+    CriticKind,
+    EnvConfig,
+    LogConfig,
+    ModelConfig,
+    PPOConfig,
+    Schedule,
+)
+from mappo_unity.train import Trainer
+
+GAMMA = 0.9
+
+
+def learn(probe, tmp_path, iterations=60, actions="discrete", model=None, ppo=None, rounds=8):
+    """Train on a probe; return the trainer and the last batch."""
+    cfg = Config(
+        env=EnvConfig(
+            name="custom",
+            backend=Backend.custom,
+            factory="probes:make",
+            params={"probe": probe, "actions": actions},
+        ),
+        model=ModelConfig(**({"hidden": [32], "normalize_obs": False} | (model or {}))),
+        ppo=PPOConfig(
+            **(
+                {
+                    "lr": 1e-2,
+                    "lr_schedule": Schedule.constant,
+                    "gamma": GAMMA,
+                    "epochs": 6,
+                    "minibatch_size": 64,
+                }
+                | {"value_norm_beta": 0.9}
+                | (ppo or {})
+            )
+        ),
+        collect=CollectConfig(rounds=rounds),
+        log=LogConfig(backends=[], progress=False),
+        max_steps=10**9,
+    )
+    trainer = Trainer(cfg, tmp_path)
+    batches = iter(trainer.make_collector())
+    for _ in range(iterations):
+        batch = trainer.entries(next(batches), "Probe")
+        trainer.learners["Probe"].learn(batch, 0.0)
+    return trainer, trainer.entries(next(batches), "Probe")
+
+
+def values(trainer, batch):
+    return trainer.learners["Probe"]._values(batch).squeeze(-1)
+
+
+def chosen(batch, actions="discrete"):
+    """Choices in [-1, 1] of the acting agents, as the probe sees them."""
+    action = batch["action"].float()
+    if actions == "continuous":
+        return action[..., 0].clamp(-3, 3) / 3
+    if actions == "mixed":
+        return (action[..., 0].clamp(-3, 3) / 3 + action[..., 1] * 2 - 1) / 2
+    return action[..., 0] * 2 - 1
+
+
+def test_constant_reward(tmp_path):
+    trainer, batch = learn("Constant", tmp_path, 30)
+    assert values(trainer, batch).mean().item() == pytest.approx(1.0, abs=0.02)
+
+
+def test_reward_that_depends_on_the_observation(tmp_path):
+    trainer, batch = learn("ObsReward", tmp_path, 40)
+    assert torch.allclose(values(trainer, batch), batch["observation"].squeeze(-1), atol=0.06)
+
+
+def test_delayed_reward_is_discounted(tmp_path):
+    trainer, batch = learn("Delayed", tmp_path, 80)
+    early = batch["observation"].squeeze(-1) == 0
+    value = values(trainer, batch)
+    assert value[early].mean().item() == pytest.approx(GAMMA, abs=0.03)
+    assert value[~early].mean().item() == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("actions", ["continuous", "discrete", "mixed"])
+def test_action_dependent_reward(tmp_path, actions):
+    _, batch = learn("ActionReward", tmp_path, 70, actions)
+    assert chosen(batch, actions).mean() > 0.9
+
+
+@pytest.mark.parametrize("actions", ["continuous", "discrete", "mixed"])
+def test_observation_and_action_dependent_reward(tmp_path, actions):
+    _, batch = learn("ObsActionReward", tmp_path, 100, actions)
+    earned = batch["observation"].squeeze(-1) * chosen(batch, actions)
+    assert earned.mean() > 0.85
+
+
+def test_joint_branches_learn_too(tmp_path):
+    _, batch = learn("ObsActionReward", tmp_path, 60, model={"flatten_branches": True})
+    assert (batch["observation"].squeeze(-1) * chosen(batch)).mean() > 0.9
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_credit_goes_to_the_member_that_earned_it(tmp_path, shared):
+    _, batch = learn("Credit", tmp_path, 60, model={"share_parameters": shared})
+    assert chosen(batch)[..., 0].mean() > 0.9
+
+
+@pytest.mark.parametrize("kind", list(CriticKind))
+def test_only_critics_that_see_the_team_know_what_a_mate_knows(tmp_path, kind):
+    trainer, batch = learn("MateKnows", tmp_path, 80, model={"critic": kind})
+    sign = batch["observation"][..., 0, 0]
+    error = (values(trainer, batch)[..., 1] - sign).abs().mean().item()
+    if kind is CriticKind.local:
+        assert error == pytest.approx(1.0, abs=0.1)
+    else:
+        assert error < 0.1
+
+
+def test_a_member_that_ends_early_learns_from_what_its_team_earns_later(tmp_path):
+    _, batch = learn("EarlyDeath", tmp_path, 80, ppo={"death_masking": True, "lr": 1e-2}, rounds=12)
+    first = batch["acting"][..., 0, 0]
+    assert chosen(batch)[..., 0][first].mean() > 0.9
+
+
+def test_without_death_masking_it_learns_nothing(tmp_path):
+    _, batch = learn("EarlyDeath", tmp_path, 80, ppo={"death_masking": False, "lr": 1e-2}, rounds=12)
+    first = batch["acting"][..., 0, 0]
+    assert chosen(batch)[..., 0][first].mean() < 0.9
+
+
+def test_an_agent_that_is_asked_every_other_round(tmp_path):
+    _, batch = learn("Staggered", tmp_path, 60)
+    acting = batch["acting"].squeeze(-1)
+    assert not acting.all()
+    assert chosen(batch)[acting].mean() > 0.9
+
+
+def test_an_agent_whose_id_changes(tmp_path):
+    trainer, batch = learn("NewIds", tmp_path, 60)
+    assert (batch["observation"].squeeze(-1) * chosen(batch)).mean() > 0.9
+    assert min(trainer.env.behaviors["Probe?team=0"].slots.agent_id) > 16
+
+
+@pytest.mark.parametrize(
+    ("probe", "expected"),
+    [
+        ("TimeLimit", 1 / (1 - GAMMA)),
+        ("RealEnd", np.mean([sum(GAMMA**k for k in range(n)) for n in range(1, 6)])),
+    ],
+)
+def test_time_limits_bootstrap_and_real_ends_do_not(tmp_path, probe, expected):
+    trainer, batch = learn(probe, tmp_path, 150, rounds=10)
+    assert values(trainer, batch).mean().item() == pytest.approx(expected, rel=0.06)
+
+
+def test_every_probe_is_tested():
+    with open(__file__) as file:
+        text = file.read()
+    assert all(f'"{name}"' in text for name in PROBES)
