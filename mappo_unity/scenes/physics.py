@@ -57,21 +57,26 @@ class AreaPhysics:
         self._num_areas = num_areas
         self._allocate()
 
-    def step(self, num_substeps: int = 1) -> None:
-        """Advance every area by `num_substeps` MuJoCo steps with constant inputs.
+    def step(self, num_substeps: int = 1, areas: np.ndarray | None = None) -> None:
+        """Advance areas by `num_substeps` MuJoCo steps with constant inputs.
 
+        `areas`: integers [n] of those that move, the others sleep (with one area a model only); None: all.
         Raises FloatingPointError: an area's state has become infinite or NaN (names the first).
         """
-        num_models = len(self._models)
-        self._state[:, 1 : 1 + self._nq] = self._qpos.reshape(num_models, -1)
-        self._state[:, 1 + self._nq : 1 + self._nq + self._nv] = self._qvel.reshape(num_models, -1)
-        control, out, sensors = self._buffers(num_substeps)
+        assert areas is None or self._per_model == 1, "areas that share a model step together"
+        rows: slice | np.ndarray = slice(None) if areas is None else areas
+        models = self._models if areas is None else [self._models[area] for area in areas.tolist()]
+        num_models, per_area = len(models), (len(models) * self._per_model, -1)
+        state = self._state[rows]  # of all areas: a view, to be changed in place; of some: a copy
+        state[:, 1 : 1 + self._nq] = self._qpos[rows].reshape(num_models, -1)
+        state[:, 1 + self._nq : 1 + self._nq + self._nv] = self._qvel[rows].reshape(num_models, -1)
+        control, out, sensors = (buffer[:num_models] for buffer in self._buffers(num_substeps))
         for columns, values in self._inputs:
-            control[:, :, columns] = values.reshape(num_models, 1, -1)
+            control[:, :, columns] = values[rows].reshape(num_models, 1, -1)
         self._rollout.rollout(
-            self._models,
+            models,
             self._data,
-            self._state,
+            state,
             control,
             skip_checks=True,
             nstep=num_substeps,
@@ -80,12 +85,12 @@ class AreaPhysics:
             sensordata=sensors,
         )
         last = out[:, -1]
-        self._state[:, 1:] = last[:, 1:]  # the clock stays 0: nothing may depend on it
-        self._qpos[...] = last[:, 1 : 1 + self._nq].reshape(self._qpos.shape)
-        self._qvel[...] = last[:, 1 + self._nq : 1 + self._nq + self._nv].reshape(self._qvel.shape)
+        self._state[rows, 1:] = last[:, 1:]  # the clock stays 0: nothing may depend on it
+        self._qpos[rows] = last[:, 1 : 1 + self._nq].reshape(per_area)
+        self._qvel[rows] = last[:, 1 + self._nq : 1 + self._nq + self._nv].reshape(per_area)
         if sensors.shape[2]:
-            self._sensordata[...] = sensors[:, -1].reshape(self._sensordata.shape)
-        if not np.isfinite(self._qvel.sum()):
+            self._sensordata[rows] = sensors[:, -1].reshape(per_area)
+        if not np.isfinite(self._qvel[rows].sum()):
             area = int(np.flatnonzero(~np.isfinite(self._qvel).all(axis=1))[0])
             raise FloatingPointError(f"physics of area {area} is not finite any more")
 
