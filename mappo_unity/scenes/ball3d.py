@@ -24,11 +24,13 @@ SPIN_KEPT = 1.0 - 0.01 * TICK_S  # angular drag 0.01/s
 CUBE_HALF = 2.5  # m
 PUSH_OUT = 0.8  # share of a penetration that the engine removes in a tick
 MAX_PUSH_OUT = 10.0 * TICK_S  # m: at most 10 m/s
+ROLLING_SHARE = 2 / 7  # of a displacement of the contact point, for a rolling solid sphere
+TOUCH_GAP = 0.01  # m
 CONTACT_SLACK = 1e-4  # m of penetration left, so that a resting ball stays in contact
 AREAS_PER_MODEL = 16  # measured: 0.8 us an area and tick, against 2.4 us with one area a model
 
 # The contact only stops the approach within one tick (damping 1 / tick, no stiffness); penetration is
-# removed by `Ball3D._push_out`, which leaves no velocity behind.
+# removed by `Ball3D._move_with_cube`, which leaves no velocity behind.
 AREA = """
 <mujoco>
   <option timestep="0.02" gravity="0 -9.81 0" solver="CG" cone="elliptic">
@@ -77,6 +79,9 @@ class Ball3D(Scene):
         self.ball_velocity = self.physics.qvel[:, 0:3]
         self.ball_spin = self.physics.qvel[:, 3:6]
         self.cube_rotation = self.physics.mocap_quat[:, 0]  # w, x, y, z
+        self._matrix = matrices(self.cube_rotation.T)  # [3, 3, N], after this tick's turn
+        self._before = np.zeros((3, self.num_areas))  # the ball in the cube's frame before the turn
+        self._turned = np.zeros(self.num_areas, bool)  # whether `_before` belongs to this episode
         self.mass = np.ones(self.num_areas)  # kg, in force since the area's last reset
         self.scale = np.ones(self.num_areas)
 
@@ -89,6 +94,7 @@ class Ball3D(Scene):
         self.ball_position[slots, 1] = 4
         self.ball_position[slots[:, None], [0, 2]] = self.rng.uniform(-1.5, 1.5, (len(slots), 2))
         self.ball_velocity[slots] = 0  # the spin is kept
+        self._turned[slots] = False
         self._read_parameters(slots)
 
     def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
@@ -104,6 +110,8 @@ class Ball3D(Scene):
     def act(self, slots: np.ndarray) -> None:
         """Turn the cubes; 0.1 replaces the reward of the window, or -1 and the end if the ball has fallen."""
         angle = np.clip(self.agents.continuous.T, -1.0, 1.0) * TURN_RAD
+        self._before = in_cube(matrices(self.cube_rotation.T), self.ball_position.T)
+        self._turned[:] = True
         rotation = limited_turn(self.cube_rotation.T, "z", angle[0])
         self.cube_rotation[...] = limited_turn(rotation, "x", angle[1]).T
         x, y, z = self.ball_position.T
@@ -114,13 +122,14 @@ class Ball3D(Scene):
             self.end_episode(fallen)
 
     def simulate(self) -> None:
-        """Damp and limit the balls' spin and push them out of the cubes as the engine does; one tick."""
+        """Advance one tick; before it move, damp and limit the balls as the engine does."""
+        self._matrix = matrices(self.cube_rotation.T)
         spin = self.ball_spin
         spin *= SPIN_KEPT
         fast = np.einsum("ni,ni->n", spin, spin) > MAX_SPIN**2
         if fast.any():
             spin[fast] *= MAX_SPIN / np.linalg.norm(spin[fast], axis=1, keepdims=True)
-        self._push_out()
+        self._move_with_cube()
         self.physics.step()
 
     def parameter_changed(self, name: str) -> None:
@@ -140,22 +149,27 @@ class Ball3D(Scene):
         self.mass[:], self.scale[:] = state["mass"], state["scale"]
         self._set_balls(changed)
 
-    def _push_out(self) -> None:
-        """Move balls that the turned cubes have penetrated out along the contact normal.
+    def _move_with_cube(self) -> None:
+        """Move balls with the surface that has turned under them, as the engine does, without velocity.
 
-        Unity's engine (PhysX) lifts the ball by a correction that is no part of its velocity afterwards; a
-        soft contact instead throws it up at the surface's speed of up to 3.5 m/s.
+        Unity's engine (PhysX) corrects positions apart from velocities: a penetration is pushed out along
+        the contact normal, and the friction anchors pull the contact point after the surface, which takes
+        a rolling solid sphere 2 / 7 of the way. A soft contact alone throws the ball up instead, at the
+        surface's speed of up to 3.5 m/s.
         """
-        local = inverse_rotated(self.cube_rotation.T, self.ball_position.T)
+        local = in_cube(self._matrix, self.ball_position.T)
         offset = local - np.clip(local, -CUBE_HALF, CUBE_HALF)  # from the cube's nearest point
         distance = np.sqrt((offset * offset).sum(axis=0))
         depth = BALL_RADIUS * self.scale - distance
-        depth -= CONTACT_SLACK
-        deep = np.flatnonzero((depth > 0) & (distance > 0))
-        if deep.size:
-            push = np.minimum(PUSH_OUT * depth[deep], MAX_PUSH_OUT) / distance[deep]
-            back = self.cube_rotation[deep].T * [[1], [-1], [-1], [-1]]
-            self.ball_position[deep] += (inverse_rotated(back, offset[:, deep]) * push).T
+        near = np.flatnonzero((depth > -TOUCH_GAP) & (distance > 0))
+        if not near.size:
+            return
+        normal = offset[:, near] / distance[near]
+        push = np.clip(PUSH_OUT * (depth[near] - CONTACT_SLACK), 0, MAX_PUSH_OUT)
+        slip = np.where(self._turned[near], self._before[:, near] - local[:, near], 0)
+        slip -= normal * (slip * normal).sum(axis=0)
+        shift = push * normal + ROLLING_SHARE * slip
+        self.ball_position[near] += np.einsum("ijn,jn->ni", self._matrix[:, :, near], shift)
 
     def _read_parameters(self, slots: np.ndarray) -> None:
         mass, scale = self.parameters["mass"], self.parameters["scale"]
@@ -171,7 +185,7 @@ class Ball3D(Scene):
             radius = BALL_RADIUS * self.scale[area]
             geom.size[0] = radius
             geom.rbound[0] = radius
-            geom.aabb[3:] = radius
+            model.geom_aabb[geom.id, 3:] = radius
             body.mass[0] = self.mass[area]
             body.inertia[:] = 0.4 * self.mass[area] * radius**2  # solid sphere
             self.physics.constants_changed(area)
@@ -191,18 +205,16 @@ def turned(rotation: np.ndarray, axis: str, angle: np.ndarray) -> np.ndarray:
     return np.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s])
 
 
-def inverse_rotated(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return vectors [3, N] rotated by the inverse of unit quaternions [4, N] (w, x, y, z).
-
-    v + w t + u x t, with u = -(x, y, z) and t = 2 u x v.
-    """
-    w, u = rotation[0], -rotation[1:]
-    t = _cross(u, 2.0 * vector)
-    return vector + w * t + _cross(u, t)
+def matrices(rotation: np.ndarray) -> np.ndarray:
+    """Return rotation matrices [3, 3, N] of unit quaternions [4, N] (w, x, y, z)."""
+    (_, _, _, _), (wx, xx, _, _), (wy, xy, yy, _), (wz, xz, yz, zz) = 2 * rotation[:, None] * rotation
+    rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
+    return np.array(rows).reshape(3, 3, -1)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
+def in_cube(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Return vectors [3, N] in the frames whose rotation matrices are [3, 3, N]."""
+    return np.einsum("ijn,in->jn", matrix, vector)
 
 
 def limited_turn(rotation: np.ndarray, axis: str, angle: np.ndarray) -> np.ndarray:
