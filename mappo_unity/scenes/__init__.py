@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 SCENES = {
     "3DBall": "ball3d:Ball3D",
     "Basic": "basic:Basic",
+    "Walker": "walker:Walker",
 }
 """Module and class of every scene, below this package."""
 

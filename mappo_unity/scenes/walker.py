@@ -114,11 +114,13 @@ class Walker(Scene):
         obs[:, 15:18] = in_frame(ahead, self.physics.target_position[slots] - self.cube_position[slots])
         parts = np.zeros((len(slots), len(_NAMES), _NUM_COLUMNS), np.float32)
         position = self.physics.position[slots]
-        vectors = np.concatenate([velocity, self.physics.spin[slots], position - position[:, :1]], axis=1)
         parts[:, :, 0] = self.grounded[slots]
-        parts[:, :, 1:10].reshape(len(slots), len(_NAMES), 3, 3)[...] = (
-            in_frame(ahead[:, None], vectors).reshape(len(slots), 3, len(_NAMES), 3).transpose(0, 2, 1, 3)
-        )
+        for column, vectors in (
+            (1, velocity),
+            (4, self.physics.spin[slots]),
+            (7, position - position[:, :1]),
+        ):
+            parts[:, :, column : column + 3] = in_frame(ahead[:, None], vectors)
         parts[:, _JOINTED, 10:14] = relative_rotation(rotation[:, _PARENTS], rotation[:, _JOINTED])
         parts[:, _JOINTED, 14] = self.strength[slots]
         obs[:, 18:] = parts.reshape(len(slots), -1)[:, _COLUMNS]

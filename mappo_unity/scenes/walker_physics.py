@@ -16,21 +16,29 @@ from mappo_unity.scenes.physics import AreaPhysics
 DRAG_KEPT = 1.0 - 0.05 * body.TICK_S  # drag and angular drag of every part, 0.05/s each
 TARGET_MAX_SPIN = 7.0  # rad/s: the engine's limit for bodies that set none
 
-_HALF = np.zeros((len(body.PARTS), 3))  # half extents of the colliders' boxes or segments, m
-_RADIUS = np.zeros(len(body.PARTS))
-_CENTRE = np.zeros((len(body.PARTS), 3))
-_REST = np.zeros((len(body.PARTS), 3))  # origins at rest, from the hips', m
-_NAMES = [part.name for part in body.PARTS]
-for _part in body.depth_first():
-    _i, (_kind, _radius, _height) = _NAMES.index(_part.name), _part.collider
-    _RADIUS[_i] = _radius
-    if _kind == "foot":
-        _HALF[_i], _CENTRE[_i] = body.FOOT_HALF, body.FOOT_CENTRE
-    elif _kind != "sphere":
-        _HALF[_i, "xy".index(_kind)] = _height / 2 - _radius
-    if _part.parent:
-        _REST[_i] = _REST[_NAMES.index(_part.parent)] + _part.offset
 
+def colliders() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the parts' colliders as boxes or segments with a radius, and their places at rest.
+
+    Half extents [B, 3] m, radius [B] m, centre [B, 3] m in the part's frame, and the part's origin at rest
+    [B, 3] m from the hips'.
+    """
+    names = [part.name for part in body.PARTS]
+    half, centre, rest = (np.zeros((len(names), 3)) for _ in range(3))
+    radius = np.zeros(len(names))
+    for part in body.depth_first():
+        number, (kind, radius_m, height) = names.index(part.name), part.collider
+        radius[number] = radius_m
+        if kind == "foot":
+            half[number], centre[number] = body.FOOT_HALF, body.FOOT_CENTRE
+        elif kind != "sphere":
+            half[number, "xy".index(kind)] = height / 2 - radius_m
+        if part.parent:
+            rest[number] = rest[names.index(part.parent)] + part.offset
+    return half, radius, centre, rest
+
+
+_HALF, _RADIUS, _CENTRE, _REST = colliders()
 _SHARE = np.array([body.JOINTS[part].share for part, _ in body.HINGES])
 _STIFFNESS = _SHARE * body.STIFFNESS  # [J] N m / rad
 _DAMPING = _SHARE * (body.DAMPING + body.TICK_S * body.STIFFNESS)  # [J] N m s / rad, of the implicit drive
@@ -130,8 +138,9 @@ class WalkerPhysics:
     def _drive(self) -> None:
         """Apply the drives: torque k (target - angle) - D rate, and armature h D, which makes it implicit.
 
-        With the armature the step solves (M + h D) v' = M v + h (k e - D v) + h D v ..., the implicit drive
-        v' = v + h M^-1 (k e - D v') with D = d + h k, and contacts feel it too.
+        M (v' - v) = h (forces + k e - D v') with D = d + h k is the drive k (target - angle) - d v, solved
+        implicitly; hence (M + h D) (v' - v) = h (forces + k e - D v), and h D is what an armature adds to M.
+        A real armature instead of an implicit force lets the contacts feel it too.
         A swing drive acts about the parent's Y, of which the hinge's share is the cosine of the twist.
         """
         error = self.drive_target - self.angle
