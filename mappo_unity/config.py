@@ -247,6 +247,20 @@ class CollectConfig:
 
 
 @dataclass
+class MatchConfig:
+    """Matches against a random side while training, for environments with two sides."""
+
+    interval: Optional[int] = None
+    """Agent decisions between two series of matches; null: none."""
+    count: int = 64
+    """Matches in a series, half of them on each side."""
+
+    def __post_init__(self) -> None:
+        _at_least("matches.interval", self.interval, 1)
+        _at_least("matches.count", self.count, 2)
+
+
+@dataclass
 class LogConfig:
     """Metrics and progress."""
 
@@ -275,6 +289,8 @@ class Config:
     """The learner."""
     collect: CollectConfig = field(default_factory=CollectConfig)
     """Collecting experience."""
+    matches: MatchConfig = field(default_factory=MatchConfig)
+    """Matches against a random side while training."""
     log: LogConfig = field(default_factory=LogConfig)
     """Metrics and progress."""
     behaviors: dict[str, Any] = field(default_factory=dict)
@@ -288,6 +304,8 @@ class Config:
     """Agent decisions between two checkpoints."""
     keep_checkpoints: int = 5
     """Newest checkpoints that are kept, besides the best one."""
+    export_onnx: bool = True
+    """Write an ONNX file, which Unity loads, beside the best and the final checkpoint."""
     device: str = "cpu"
     """Device of the networks: cpu, cuda or cuda:N."""
     num_threads: int = 1
@@ -316,17 +334,31 @@ class EvalConfig:
     """Options of an evaluation."""
 
     run: str = "???"
-    """Run folder (its best checkpoint is played) or checkpoint file; must be given."""
+    """Run folder (its best checkpoint is played), checkpoint file or ONNX file; must be given."""
     episodes: int = 100
-    """Agent episodes to play."""
+    """Agent episodes to play; matches, when there is an opponent."""
+    opponent: Optional[str] = None
+    """Play matches, both sides in turn, against random, or another run folder or checkpoint."""
     deterministic: bool = False
     """Take the most likely action instead of a sampled one."""
     seed: int = 0
     """Seed of the environment and the sampling."""
+    env: Optional[str] = None
+    """Environment to play in, a preset in conf/env; null: that of the run."""
 
     def __post_init__(self) -> None:
         _at_least("episodes", self.episodes, 1)
         _within("seed", self.seed, 0, 2**31 - 1)
+
+
+@dataclass
+class ExportConfig:
+    """Options of an export."""
+
+    run: str = "???"
+    """Run folder (its best checkpoint is exported) or checkpoint file; must be given."""
+    out: Optional[str] = None
+    """File (NAME.onnx) or folder to write; null: beside the checkpoint, under its name."""
 
 
 def _rule(option: str, value: float | None, holds: bool, rule: str) -> None:

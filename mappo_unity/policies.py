@@ -48,19 +48,20 @@ class RandomPolicy:
         return action
 
 
-class CheckpointPolicy:
-    """The actors of a checkpoint.
+class ActorPolicy:
+    """Actors of policy names, as they are now.
 
-    Raises:
-        CheckpointError: the file cannot be read.
+    Args:
+        layout: what each was built for, as `describe_spec` returns it.
+        actors: the networks by policy name.
+        deterministic: take the most likely action.
+        name: what to call them in errors.
     """
 
-    def __init__(self, path: Path, deterministic: bool) -> None:
-        state = checkpoint.load(path)
-        self.path, self.deterministic = path, deterministic
-        self.agent_steps = int(state["agent_steps"])
-        self.layout = state["layout"]
-        self.actors = {name: _actor(state, name) for name in self.layout}
+    def __init__(
+        self, layout: dict[str, Any], actors: dict[str, Any], deterministic: bool, name: str
+    ) -> None:
+        self.layout, self.actors, self.deterministic, self.name = layout, actors, deterministic, name
 
     @torch.no_grad()
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
@@ -88,9 +89,24 @@ class CheckpointPolicy:
         found = describe_spec(spec, known["team_size"] if known else 1)
         if known != found:
             raise ConfigError(
-                f"checkpoint {self.path} cannot play {behavior!r}: it was trained for {self.layout}, "
+                f"{self.name} cannot play {behavior!r}: it was trained for {self.layout}, "
                 f"but the environment has {found}"
             )
+
+
+class CheckpointPolicy(ActorPolicy):
+    """The actors of a checkpoint.
+
+    Raises:
+        CheckpointError: the file cannot be read.
+    """
+
+    def __init__(self, path: Path, deterministic: bool) -> None:
+        state = checkpoint.load(path)
+        actors = {name: _actor(state, name) for name in state["layout"]}
+        super().__init__(state["layout"], actors, deterministic, f"checkpoint {path}")
+        self.path = path
+        self.agent_steps = int(state["agent_steps"])
 
 
 class Places(NamedTuple):

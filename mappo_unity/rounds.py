@@ -35,6 +35,7 @@ class Episode(NamedTuple):
     group_return: float
     length: int  # decisions
     interrupted: bool
+    group_id: int = 0  # 0 = alone
 
 
 @dataclass

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import logging
 import math
-import random
 import signal
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
@@ -28,11 +26,15 @@ from mappo_unity.behavior_options import check_behaviors, options_of
 from mappo_unity.collect import make_collector
 from mappo_unity.config import Config, ConfigError
 from mappo_unity.encoders import ObsLayout
+from mappo_unity.export import RunExports, sample_inputs
+from mappo_unity.fit import check_fits, describe_models, describe_policies
 from mappo_unity.log import RunLog, check_backends
+from mappo_unity.matches import Score, play_matches
 from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
 from mappo_unity.models import JointPolicy, make_actor, make_critic
-from mappo_unity.policies import describe_spec
+from mappo_unity.policies import ActorPolicy, RandomPolicy
 from mappo_unity.ppo import PolicyLearner
+from mappo_unity.rng import get_rng_state, seed_everything, set_rng_state
 from mappo_unity.transforms import transformed
 from mappo_unity.unity_env import UnityEnv
 
@@ -71,9 +73,7 @@ def prepare_torch(cfg: Config) -> None:
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every storage
     if cfg.device.startswith("cuda") and not torch.cuda.is_available():
         raise ConfigError(f"device={cfg.device}: this torch finds no CUDA device; use device=cpu")
-    random.seed(cfg.seed)
-    np.random.seed(cfg.seed % 2**32)
-    torch.manual_seed(cfg.seed)
+    seed_everything(cfg.seed)
 
 
 def make_unity_env(cfg: Config) -> UnityEnv:
@@ -125,11 +125,15 @@ class Trainer:
         self.iteration = self.agent_steps = 0
         self.wall_s = 0.0
         self.saved_at = 0
-        self.best_return = -math.inf
+        self.best_score = -math.inf
+        self.matched_at = 0
+        self.win_rate = math.nan
         self.last_checkpoint: Path | None = None
         self.stop_signal: int | None = None
         self.resumed = False
         self.log: RunLog | None = None
+        self.samples: dict[str, dict[str, torch.Tensor]] = {}  # what an export is compared on
+        self.exports: RunExports | None = None
 
     # --- the loop
 
@@ -137,6 +141,8 @@ class Trainer:
         """Iterate until the steps are done, the return is reached or a signal comes."""
         resume_steps = self.agent_steps if self.resumed else None
         self.log = RunLog(self.cfg.log, self.folder, self.cfg.max_steps, resume_steps)
+        if self.cfg.export_onnx:
+            self.exports = RunExports(self.folder, self.log.message)
         collector = self.make_collector()
         handlers = {s: signal.signal(s, self._on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
         rng_state = getattr(self, "_rng_state", None)
@@ -149,6 +155,8 @@ class Trainer:
                 self.iterate(batches)
                 status = self._status()
             self.save()
+            if self.exports is not None:
+                self.exports.finish(self.last_checkpoint)
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
@@ -175,6 +183,10 @@ class Trainer:
         collected = time.perf_counter()
         learned = self._learn(batch)
         steps = count_decisions(batch, list(self.learners))
+        self.samples = {
+            name: sample_inputs(batch.get(name), learner.actor.in_keys)
+            for name, learner in self.learners.items()
+        }
         end = time.perf_counter()
 
         self.iteration += 1
@@ -187,6 +199,7 @@ class Trainer:
             "update_s": end - collected,
         }
         self._report(learned)
+        learned |= self._play_matches()
         self._log_row(
             {"episodes": self.window.total, "episodes_new": episodes}
             | self.window.summary()
@@ -226,6 +239,36 @@ class Trainer:
                 f"{learned['rollbacks']:.0f} so far"
             )
 
+    def _play_matches(self) -> dict[str, float]:
+        """Play a series against a random side when it is time; training's random numbers stay untouched."""
+        interval = self.cfg.matches.interval
+        if interval is None or self.agent_steps - self.matched_at < interval:
+            return {}
+        self.matched_at = self.agent_steps
+        actors = {name: learner.actor for name, learner in self.learners.items()}
+        player = ActorPolicy(self._layout(), actors, False, "the policy")
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.cfg.seed + self.agent_steps)
+            make_env = make_env_function(self.cfg.env)
+            seed = (self.cfg.seed + self.agent_steps) % 2**31
+            scores = play_matches(make_env, player, RandomPolicy(seed), self.cfg.matches.count, seed)
+        total = sum(scores.values(), Score())
+        self.win_rate = total.figures()["won_of_decided"]
+        return {
+            "win_rate_vs_random": self.win_rate,
+            "draw_rate_vs_random": total.draws / max(1, total.matches),
+            "match_decisions_vs_random": total.decisions / max(1, total.matches),
+        }
+
+    def _score(self) -> float:
+        """What the best checkpoint is chosen by: return_mean, or the win rate where two sides share a policy.
+
+        (There one side's gain is the other's loss, and the mean return says nothing.)
+        """
+        if any(len(sides) > 1 for sides in self.env.sides.values()):
+            return self.win_rate if math.isfinite(self.win_rate) else float(self.agent_steps) * 1e-12
+        return self.window.summary()["return_mean"]
+
     def _status(self) -> str | None:
         if self.stop_signal is not None:
             return "interrupted"
@@ -249,14 +292,16 @@ class Trainer:
         """Write a checkpoint of everything, unless one of this moment is there."""
         if self.last_checkpoint is not None and self.saved_at == self.agent_steps:
             return
-        return_mean = self.window.summary()["return_mean"]
-        best = return_mean > self.best_return
+        score = self._score()
+        best = score > self.best_score
         if best:
-            self.best_return = return_mean
+            self.best_score = score
         self.saved_at = self.agent_steps
         self.last_checkpoint = checkpoint.save_in(
             self.folder, self.agent_steps, self.state_dict(), self.cfg.keep_checkpoints, best
         )
+        if best and self.exports is not None:
+            self.exports.best_changed()
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that continuing needs, between two iterations."""
@@ -268,10 +313,11 @@ class Trainer:
             "env": self.env.get_state(),
             "window": self.window.state_dict(),
             "rng": get_rng_state(),
+            "samples": self.samples,
             **{name: getattr(self, name) for name in self._COUNTERS},
         }
 
-    _COUNTERS = ("iteration", "agent_steps", "wall_s", "saved_at", "best_return")
+    _COUNTERS = ("iteration", "agent_steps", "wall_s", "saved_at", "best_score", "matched_at", "win_rate")
 
     def load(self, path: Path) -> None:
         """Continue from a checkpoint.
@@ -289,6 +335,7 @@ class Trainer:
         for name in self._COUNTERS:
             setattr(self, name, state[name])
         self._rng_state = state["rng"]
+        self.samples = state.get("samples", {})
         self.last_checkpoint = path
         self.resumed = True
 
@@ -296,7 +343,7 @@ class Trainer:
         return describe_policies(self.env)
 
     def _models(self) -> dict[str, Any]:
-        return {name: plain(asdict(options_of(self.cfg, name)[0])) for name in self.learners}
+        return describe_models({name: options_of(self.cfg, name)[0] for name in self.learners})
 
     def close(self) -> None:
         """Close the environment and the logs."""
@@ -304,72 +351,3 @@ class Trainer:
             self.log.close()
         if not self.env.is_closed:
             self.env.close()
-
-
-def describe_policies(env: UnityEnv) -> dict[str, Any]:
-    """Return what a network must fit: sensors, actions and team size of every policy name."""
-    out = {}
-    for name, sides in env.sides.items():
-        behavior = env.behaviors[sides[0]]
-        out[name] = describe_spec(behavior.spec, behavior.slots.team_size)
-    return out
-
-
-def check_fits(
-    path: Path, state: dict[str, Any], env_name: str, layout: dict[str, Any], models: dict[str, Any]
-) -> None:
-    """Refuse a checkpoint of another environment or network, saying what differs."""
-    if state["env_name"] != env_name:
-        raise checkpoint.CheckpointError(
-            f"checkpoint {path} was written for env={state['env_name']}, not for env={env_name}"
-        )
-    if state["layout"] != layout:
-        raise checkpoint.CheckpointError(
-            f"checkpoint {path} was written for policies {state['layout']}, but the environment has {layout}"
-        )
-    different = []
-    for name, model in models.items():
-        saved = state["model"][name]
-        different += [
-            f"model.{k}={saved.get(k)} there, {v} here" for k, v in model.items() if saved.get(k) != v
-        ]
-    if different:
-        raise checkpoint.CheckpointError(f"checkpoint {path} holds another network: {'; '.join(different)}")
-
-
-def get_rng_state() -> dict[str, Any]:
-    """Return the states of torch's, numpy's and Python's global generators."""
-    kind, keys_, position, has_gauss, cached = np.random.get_state()
-    version, internal, gauss_next = random.getstate()
-    return {
-        "torch": torch.get_rng_state(),
-        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "numpy": [
-            str(kind),
-            np.asarray(keys_).astype(np.int64),
-            int(position),
-            int(has_gauss),
-            float(cached),
-        ],
-        "python": [int(version), list(internal), gauss_next],
-    }
-
-
-def set_rng_state(state: dict[str, Any]) -> None:
-    """Go back to what `get_rng_state` returned."""
-    torch.set_rng_state(state["torch"])
-    if state["cuda"] and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all(state["cuda"])
-    kind, keys_, position, has_gauss, cached = state["numpy"]
-    np.random.set_state((kind, np.asarray(keys_).astype(np.uint32), position, has_gauss, cached))
-    version, internal, gauss_next = state["python"]
-    random.setstate((version, tuple(internal), gauss_next))
-
-
-def plain(value: Any) -> Any:
-    """Turn enums into their values, all through a nested dict or list."""
-    if isinstance(value, dict):
-        return {key: plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
-    return getattr(value, "value", value)

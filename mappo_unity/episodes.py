@@ -1,0 +1,104 @@
+"""Play episodes of a BaseEnv with fixed policies and sum up what they earn.
+
+In: a BaseEnv and a policy for each behavior. Out: finished episodes, and figures as a dict.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from mlagents_envs.base_env import BaseEnv
+
+from mappo_unity.policies import Policy
+from mappo_unity.rounds import Episode
+
+MAX_ENV_STEPS = 5_000_000
+
+
+def play(
+    env: BaseEnv, policy: Policy | dict[str, Policy], episodes: int, only: str | None = None
+) -> dict[str, list[Episode]]:
+    """Play until the first ``episodes`` episodes *begun* of every behavior (or of ``only``) have ended.
+
+    Counting the first ones begun, not the first ones ended, gives long episodes their due weight.
+
+    Returns:
+        The episodes of every behavior, in the order of their ends.
+    """
+    running: dict[tuple[str, int], list[float]] = {}
+    counts = _Counts(episodes)
+    env.reset()
+    for _ in range(MAX_ENV_STEPS):
+        for name in env.behavior_specs:
+            decision, terminal = env.get_steps(name)
+            _end_episodes(name, terminal, running, counts)
+            _go_on(name, decision, running, counts)
+            if len(decision):
+                actor = policy[name] if isinstance(policy, dict) else policy
+                env.set_actions(name, actor.act(name, decision, env.behavior_specs[name]))
+        if counts.complete([only] if only else list(env.behavior_specs)):
+            return counts.ended
+        env.step()
+    raise RuntimeError(f"{episodes} episodes did not end within {MAX_ENV_STEPS} environment steps")
+
+
+class _Counts:
+    """Which episodes count: the first ``wanted`` begun of each behavior."""
+
+    def __init__(self, wanted: int) -> None:
+        self.wanted = wanted
+        self.begun: dict[str, int] = {}
+        self.ended: dict[str, list[Episode]] = {}
+
+    def begin(self, name: str) -> bool:
+        self.begun[name] = self.begun.get(name, 0) + 1
+        return self.begun[name] <= self.wanted
+
+    def complete(self, names: list[str]) -> bool:
+        return all(len(self.ended.get(name, [])) >= self.wanted for name in names)
+
+
+def _end_episodes(name: str, terminal: Any, running: dict, counts: _Counts) -> None:
+    for row, agent in enumerate(terminal.agent_id.tolist()):
+        episode = running.pop((name, agent), None)
+        if episode is None:
+            continue
+        counted, individual, group, length = episode
+        individual, group = (
+            individual + float(terminal.reward[row]),
+            group + float(terminal.group_reward[row]),
+        )
+        if counted:
+            cut, group_id = bool(terminal.interrupted[row]), int(terminal.group_id[row])
+            ended = Episode(agent, individual, group, int(length), cut, group_id)
+            counts.ended.setdefault(name, []).append(ended)
+
+
+def _go_on(name: str, decision: Any, running: dict, counts: _Counts) -> None:
+    for row, agent in enumerate(decision.agent_id.tolist()):
+        episode = running.get((name, agent))
+        if episode is None:
+            episode = running[name, agent] = [float(counts.begin(name)), 0.0, 0.0, 0.0]
+        episode[1] += float(decision.reward[row])
+        episode[2] += float(decision.group_reward[row])
+        episode[3] += 1
+
+
+def summarize(episodes: list[Episode]) -> dict[str, Any]:
+    """Return the figures of episodes: returns with standard errors, length, share interrupted."""
+    individual, group = (
+        np.array(x, float) for x in zip(*[(e.individual_return, e.group_return) for e in episodes])
+    )
+    returns = individual + group
+    out = {
+        "episodes": len(episodes),
+        "mean_return": float(returns.mean()),
+        "stderr": float(returns.std() / math.sqrt(len(returns))),
+        "mean_decisions": float(np.mean([e.length for e in episodes])),
+        "interrupted": float(np.mean([e.interrupted for e in episodes])),
+    }
+    if group.any():
+        out |= {"mean_individual_return": float(individual.mean()), "mean_group_return": float(group.mean())}
+    return out

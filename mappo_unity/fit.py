@@ -1,0 +1,60 @@
+"""Whether a checkpoint fits an environment and its options.
+
+In: a checkpoint's entries, a `UnityEnv`, model options. Out: nothing, or an error that says what differs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mappo_unity.checkpoint import CheckpointError
+from mappo_unity.config import ModelConfig
+from mappo_unity.policies import describe_spec
+from mappo_unity.unity_env import UnityEnv
+
+
+def describe_policies(env: UnityEnv) -> dict[str, Any]:
+    """Return what a network must fit: sensors, actions and team size of every policy name."""
+    out = {}
+    for name, sides in env.sides.items():
+        behavior = env.behaviors[sides[0]]
+        out[name] = describe_spec(behavior.spec, behavior.slots.team_size)
+    return out
+
+
+def check_fits(
+    path: Path, state: dict[str, Any], env_name: str, layout: dict[str, Any], models: dict[str, Any]
+) -> None:
+    """Refuse a checkpoint of another environment or network, saying what differs."""
+    if state["env_name"] != env_name:
+        raise CheckpointError(
+            f"checkpoint {path} was written for env={state['env_name']}, not for env={env_name}"
+        )
+    if state["layout"] != layout:
+        raise CheckpointError(
+            f"checkpoint {path} was written for policies {state['layout']}, but the environment has {layout}"
+        )
+    different = []
+    for name, model in models.items():
+        saved = state["model"][name]
+        different += [
+            f"model.{k}={saved.get(k)} there, {v} here" for k, v in model.items() if saved.get(k) != v
+        ]
+    if different:
+        raise CheckpointError(f"checkpoint {path} holds another network: {'; '.join(different)}")
+
+
+def plain(value: Any) -> Any:
+    """Turn enums into their values, all through a nested dict or list."""
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    return getattr(value, "value", value)
+
+
+def describe_models(models: dict[str, ModelConfig]) -> dict[str, Any]:
+    """Return the model options of every policy name as plain values."""
+    return {name: plain(asdict(model)) for name, model in models.items()}

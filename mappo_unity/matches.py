@@ -1,0 +1,145 @@
+"""Matches between two policies in a two-sided scene, both sides in turn.
+
+In: a function that opens the environment, two policies. Out: wins, draws and losses with a
+confidence interval. A side is a team id (``Name?team=1``): its behaviors belong to one player.
+
+A match is one episode of a team. The side whose group reward (individual reward where there are no
+groups) is positive at its end has won, one with a negative one has lost; anything else is a draw.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from mlagents_envs.base_env import BaseEnv
+
+from mappo_unity.backend import MakeEnv
+from mappo_unity.config import ConfigError
+from mappo_unity.episodes import play
+from mappo_unity.keys import team_id
+from mappo_unity.policies import Policy
+from mappo_unity.rounds import Episode
+
+Z95 = 1.959964  # two-sided 95 % quantile of the standard normal distribution
+
+
+@dataclass
+class Score:
+    """Outcomes of matches, seen from one player."""
+
+    wins: int = 0
+    draws: int = 0
+    losses: int = 0
+    decisions: int = 0  # over all matches
+
+    def __add__(self, other: Score) -> Score:
+        return Score(
+            self.wins + other.wins,
+            self.draws + other.draws,
+            self.losses + other.losses,
+            self.decisions + other.decisions,
+        )
+
+    @property
+    def matches(self) -> int:
+        """Number of matches."""
+        return self.wins + self.draws + self.losses
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures for a table; the interval is that of the share of decided matches won."""
+        decided = self.wins + self.losses
+        low, high = wilson(self.wins, decided)
+        return {
+            "matches": self.matches,
+            "wins": self.wins,
+            "draws": self.draws,
+            "losses": self.losses,
+            "won_of_decided": self.wins / decided if decided else math.nan,
+            "won_of_decided_low95": low,
+            "won_of_decided_high95": high,
+            "goal_difference": (self.wins - self.losses) / max(1, self.matches),
+            "mean_decisions": self.decisions / max(1, self.matches),
+        }
+
+
+def play_matches(
+    make_env: MakeEnv, player: Policy, opponent: Policy, matches: int, seed: int
+) -> dict[str, Score]:
+    """Play ``matches`` matches, half of them with the sides swapped.
+
+    Returns:
+        The player's score as each side, under the names of the side's behaviors.
+
+    Raises:
+        ConfigError: the environment has not two sides.
+    """
+    scores: dict[str, Score] = {}
+    env = make_env(seed)
+    try:
+        sides = find_sides(env)
+        for index, side in enumerate(sides):
+            own, other = sides[side], [b for s, names in sides.items() if s != side for b in names]
+            policies = dict.fromkeys(own, player) | dict.fromkeys(other, opponent)
+            count = (matches + 1 - index) // 2
+            scores["+".join(own)] = play_side(env, policies, own, max(1, count))
+    finally:
+        env.close()
+    return scores
+
+
+def find_sides(env: BaseEnv) -> dict[int, list[str]]:
+    """Return the behaviors of each side; behaviors appear with the first reset.
+
+    Raises:
+        ConfigError: there are not two sides.
+    """
+    env.reset()
+    sides: dict[int, list[str]] = {}
+    for name in env.behavior_specs:
+        sides.setdefault(team_id(name), []).append(name)
+    if len(sides) != 2:
+        raise ConfigError(
+            f"opponent=...: matches need an environment with two sides (team ids); this one has "
+            f"{len(sides)}: {', '.join(env.behavior_specs)}"
+        )
+    return dict(sorted(sides.items()))
+
+
+def play_side(env: BaseEnv, policies: dict[str, Policy], own: list[str], matches: int) -> Score:
+    """Play until the first ``matches`` team episodes begun by the first of our behaviors have ended."""
+    name = own[0]
+    env.reset()
+    groups = env.get_steps(name)[0].group_id
+    members = max(1, int((groups == groups[0]).sum())) if groups[0] > 0 else 1
+    episodes = play(env, policies, matches * members, only=name)[name]
+    return count(episodes, grouped=bool(groups[0] > 0))
+
+
+def count(episodes: list[Episode], grouped: bool) -> Score:
+    """Sum up the outcomes; of the members of a team the first to end in a match speaks for it."""
+    score = Score()
+    ends_of: dict[tuple[int, int], int] = {}
+    seen: set[tuple[int, int]] = set()
+    for episode in episodes:
+        if grouped:
+            agent = (episode.group_id, episode.agent_id)
+            ends_of[agent] = ends_of.get(agent, 0) + 1
+            match = (episode.group_id, ends_of[agent])
+            if match in seen:
+                continue
+            seen.add(match)
+        result = episode.group_return if grouped else episode.individual_return
+        score += Score(int(result > 0), int(result == 0), int(result < 0), episode.length)
+    return score
+
+
+def wilson(wins: int, total: int) -> tuple[float, float]:
+    """Return Wilson's 95 % confidence interval of a share (Wilson 1927)."""
+    if not total:
+        return math.nan, math.nan
+    share, z2 = wins / total, Z95**2
+    middle = (share + z2 / (2 * total)) / (1 + z2 / total)
+    half = Z95 * math.sqrt(share * (1 - share) / total + z2 / (4 * total**2)) / (1 + z2 / total)
+    return middle - half, middle + half
