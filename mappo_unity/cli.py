@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.config import Config, ConfigError, EvalConfig
+from mappo_unity.config import Config, ConfigError, EvalConfig, ExportConfig
 
 _SIGNALS = {2: "SIGINT", 15: "SIGTERM"}
 
@@ -24,6 +24,11 @@ def train_main(arguments: list[str] | None = None) -> int:
 def eval_main(arguments: list[str] | None = None) -> int:
     """Run mappo-eval: play episodes with a trained policy; return the exit code."""
     return _run_command("mappo-eval", _eval_command, _eval_help, arguments)
+
+
+def export_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-export: write a trained policy as ONNX files; return the exit code."""
+    return _run_command("mappo-export", _export_command, _export_help, arguments)
 
 
 def _run_command(
@@ -58,6 +63,12 @@ def _eval_help() -> str:
     from mappo_unity.help import eval_help
 
     return eval_help(EvalConfig)
+
+
+def _export_help() -> str:
+    from mappo_unity.help import export_help
+
+    return export_help(ExportConfig)
 
 
 def _train_command(lines: list[str]) -> int:
@@ -143,12 +154,11 @@ def _sweep(lines: list[str]) -> int:
 
 
 def _eval_command(lines: list[str]) -> int:
-    from mappo_unity.compose import check_factory, compose_plain, load_config
-    from mappo_unity.runs import CONFIG, find_run
+    from mappo_unity.compose import check_factory, compose_plain, config_to_play
 
     options = vars(compose_plain(lines, EvalConfig))
     run = Path(options.pop("run"))
-    check_factory(load_config(find_run(run, "run") / CONFIG))
+    check_factory(config_to_play(run, options["env"]))
     from mappo_unity.evaluate import evaluate
 
     result: dict[str, Any] = evaluate(run, **options)
@@ -156,4 +166,23 @@ def _eval_command(lines: list[str]) -> int:
 
     report.console().print(report.eval_table(result))
     print(report.json_line(result))
+    return 0
+
+
+def _export_command(lines: list[str]) -> int:
+    from mappo_unity.compose import compose_plain
+    from mappo_unity.runs import find_run
+
+    options = compose_plain(lines, ExportConfig)
+    run = Path(options.run)
+    find_run(run, "run")
+    from mappo_unity.evaluate import choose_checkpoint
+    from mappo_unity.export import export_checkpoint
+
+    checkpoint = choose_checkpoint(run)
+    for file in export_checkpoint(checkpoint, Path(options.out) if options.out else None):
+        print(
+            f"{file.path}: {file.policy} after {file.agent_steps:,} agent steps; plays as {checkpoint} does "
+            f"(on {file.rows} observations: actions to {file.error:.1e}, samples in distribution)"
+        )
     return 0

@@ -24,6 +24,7 @@ from mappo_unity.config import Config, ConfigError
 from mappo_unity.options import did_you_mean, option_table
 from mappo_unity.overrides import SWEEP_EXTRA, check_overrides, given, open_line, parse
 from mappo_unity.presets import conf_dir, group_choices
+from mappo_unity.runs import CONFIG, find_run
 
 _NOISE = ("object_type=", "reference_type=", "Config search path", "provider=", "See ", "To append")
 
@@ -110,6 +111,22 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
 def load_config(path: Path) -> Config:
     """Return the options that a run's config.yaml holds; raise ConfigError."""
     return compose_config([], path).config
+
+
+def config_to_play(run: Path, env: str | None) -> Config:
+    """Return the options of the environment in which a run or an ONNX file is played; raise ConfigError.
+
+    `env` names a preset; without it it is that of the run's folder, or of the one the file lies in.
+    """
+    if env is not None:
+        return compose_config([f"env={env}"]).config
+    try:
+        return load_config(find_run(run, "run") / CONFIG)
+    except ConfigError as error:
+        if not run.is_file():
+            raise
+        choices = ", ".join(group_choices()["env"])
+        raise ConfigError(f"{error}; or say in which environment to play it: env=NAME ({choices})") from error
 
 
 def to_config(tree: DictConfig) -> Config:

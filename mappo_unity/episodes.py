@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
+from mappo_unity.onnx_policy import OnnxPolicy
 from mappo_unity.policies import Policy
 from mappo_unity.rounds import Episode
 
@@ -34,9 +35,11 @@ def play(
         for name in env.behavior_specs:
             decision, terminal = env.get_steps(name)
             _end_episodes(name, terminal, running, counts)
+            actor = policy[name] if isinstance(policy, dict) else policy
+            if isinstance(actor, OnnxPolicy):  # it may remember what agents saw in their last episode
+                actor.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
             _go_on(name, decision, running, counts)
             if len(decision):
-                actor = policy[name] if isinstance(policy, dict) else policy
                 env.set_actions(name, actor.act(name, decision, env.behavior_specs[name]))
         if counts.complete([only] if only else list(env.behavior_specs)):
             return counts.ended

@@ -34,10 +34,22 @@ Play episodes with a trained policy and print their statistics: a table, then on
 
 Usage:
   mappo-eval run=RUN [option=value ...]     a run folder (its best checkpoint) or a checkpoint
+  mappo-eval run=FILE.onnx [env=NAME ...]   an ONNX file, in its run's environment or another
   mappo-eval --help | --version
 
 Example:
   mappo-eval run=outputs/3DBall/2026-11-20_12-00-00 episodes=100 deterministic=true
+"""
+
+EXPORT_USAGE = """\
+Write a trained policy as an ONNX file, which Unity loads: one file for each behavior name.
+
+Usage:
+  mappo-export run=RUN [out=PATH]           a run folder (its best checkpoint) or a checkpoint
+  mappo-export --help | --version
+
+Example:
+  mappo-export run=outputs/3DBall/2026-11-20_12-00-00 out=3DBall.onnx
 """
 
 
@@ -50,6 +62,11 @@ def train_help(schema: type) -> str:
 def eval_help(schema: type) -> str:
     """Return the help of mappo-eval: usage, options."""
     return f"{EVAL_USAGE}\n{option_text(schema)}"
+
+
+def export_help(schema: type) -> str:
+    """Return the help of mappo-export: usage, options."""
+    return f"{EXPORT_USAGE}\n{option_text(schema)}"
 
 
 def option_text(schema: type) -> str:

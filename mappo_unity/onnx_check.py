@@ -1,0 +1,144 @@
+"""An ONNX model against the actor that it was made from, on the same observations.
+
+In: a model's bytes, the actor, some of its inputs. Out: the largest difference, or an ExportError.
+Deterministic actions must agree to 1e-5, sampled ones in distribution. Knows nothing of files.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from mappo_unity import keys
+from mappo_unity.actions import CONTINUOUS_LIMIT, ActionDistribution
+from mappo_unity.onnx_graph import ExportError
+from mappo_unity.onnx_policy import fit_image, open_session
+
+TOLERANCE = 1e-5  # of deterministic actions, and of the log-probability of the branch taken
+DRAWS = 8192  # sampled actions that are compared
+SIGMAS = 6.0  # a right model fails the comparison of its samples about once in a million times
+
+
+def compare(
+    data: bytes, actor: Any, sensors: Sequence[Sequence[int]], sample: dict[str, torch.Tensor]
+) -> float:
+    """Play a model in onnxruntime and the actor in torch on the same observations.
+
+    Args:
+        sample: the actor's inputs, ``[n, ...]``.
+
+    Returns:
+        The largest difference: of deterministic continuous actions, or by which the log-probability
+        of a deterministic branch falls short of the best one's.
+
+    Raises:
+        ExportError: they play differently.
+    """
+    session = open_session(data, "the export")
+    feed = _feed(session, sensors, sample)
+    with torch.no_grad():
+        params = actor[0](TensorDict(sample, [len(next(iter(sample.values())))])).get("params")
+    expected = ActionDistribution(params, actor[0].module.layout, sample.get(keys.MASK))
+    found = _run(session, feed, "deterministic_", expected)
+    error = max(_continuous_error(expected, found), _branch_error(expected, found))
+    if not error <= TOLERANCE:
+        raise ExportError(
+            "the export plays otherwise than the checkpoint: its deterministic actions differ by "
+            f"{error:.3g}, more than {TOLERANCE:g}"
+        )
+    runs = math.ceil(DRAWS / len(params))
+    drawn = [_run(session, feed, "", expected) for _ in range(runs)]
+    _compare_continuous(expected, drawn)
+    _compare_branches(expected, drawn)
+    return error
+
+
+def _feed(
+    session: Any, sensors: Sequence[Sequence[int]], sample: dict[str, torch.Tensor]
+) -> dict[str, np.ndarray]:
+    """Split an actor's inputs into those of the graph."""
+    arrays = {key: values.numpy() for key, values in sample.items()}
+    shapes = {i.name: list(i.shape) for i in session.get_inputs()}
+    feed, start = {}, 0
+    for index, shape in enumerate(sensors):
+        name = f"obs_{index}"
+        if len(shape) == 1:
+            feed[name] = arrays[keys.OBS][:, start : start + shape[0]]
+            start += shape[0]
+        else:
+            feed[name] = fit_image(arrays[keys.SENSOR.format(index)], shapes[name])
+    if keys.MASK in arrays:
+        feed["action_masks"] = arrays[keys.MASK]
+    return {name: np.ascontiguousarray(values, np.float32) for name, values in feed.items()}
+
+
+def _run(
+    session: Any, feed: dict[str, np.ndarray], prefix: str, expected: ActionDistribution
+) -> dict[str, torch.Tensor]:
+    kinds = {"continuous": expected.layout.continuous, "discrete": len(expected.layout.branches)}
+    names = [kind for kind, size in kinds.items() if size]
+    outputs = session.run([f"{prefix}{kind}_actions" for kind in names], feed)
+    return {kind: torch.from_numpy(values) for kind, values in zip(names, outputs)}
+
+
+def _continuous_error(expected: ActionDistribution, found: dict[str, torch.Tensor]) -> float:
+    if "continuous" not in found:
+        return 0.0
+    wanted = expected.loc.clamp(-CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT
+    return float((found["continuous"] - wanted).abs().max())
+
+
+def _branch_error(expected: ActionDistribution, found: dict[str, torch.Tensor]) -> float:
+    if "discrete" not in found:
+        return 0.0
+    chosen = expected.layout.to_categories(found["discrete"])
+    shortfall = [
+        log_probs.max(-1).values - log_probs.gather(-1, chosen[:, branch, None])[:, 0]
+        for branch, log_probs in enumerate(expected.log_probs)
+    ]
+    return float(torch.stack(shortfall).max())
+
+
+def _compare_continuous(expected: ActionDistribution, drawn: list[dict[str, torch.Tensor]]) -> None:
+    """Compare how many draws lie below mean - std, mean and mean + std, where clipping is no matter."""
+    if "continuous" not in drawn[0]:
+        return
+    draws = torch.stack([d["continuous"] for d in drawn]) * CONTINUOUS_LIMIT
+    std = expected.log_std.exp()
+    for sigmas in (-1.0, 0.0, 1.0):
+        limit = expected.loc + sigmas * std
+        inside = limit.abs() < CONTINUOUS_LIMIT - 1e-3
+        share = 0.5 * (1 + math.erf(sigmas / math.sqrt(2)))
+        count = inside.sum(0) * len(draws)
+        below = ((draws <= limit) & inside).sum((0, 1))
+        _require(below, count * share, count * share * (1 - share), "continuous actions")
+
+
+def _compare_branches(expected: ActionDistribution, drawn: list[dict[str, torch.Tensor]]) -> None:
+    """Compare how often each category was drawn."""
+    if "discrete" not in drawn[0]:
+        return
+    chosen = expected.layout.to_categories(torch.stack([d["discrete"] for d in drawn]))
+    for branch, log_probs in enumerate(expected.log_probs):
+        probs = log_probs.double().exp()
+        counts = torch.nn.functional.one_hot(chosen[..., branch], probs.shape[-1]).sum(0)
+        if (counts[probs == 0] > 0).any():
+            raise ExportError(f"the export draws forbidden actions of branch {branch}")
+        mean, var = probs * len(chosen), probs * (1 - probs) * len(chosen)
+        _require(counts.sum(0), mean.sum(0), var.sum(0), f"actions of branch {branch}")
+
+
+def _require(counts: torch.Tensor, mean: torch.Tensor, var: torch.Tensor, what: str) -> None:
+    """Raise unless counts lie within six standard deviations (and ten, for the rarest) of their means."""
+    off = (counts - mean).abs()
+    if (off > SIGMAS * var.sqrt() + 10).any():
+        worst = int((off - SIGMAS * var.sqrt()).argmax())
+        raise ExportError(
+            f"the export samples other {what} than the checkpoint: in column {worst} {counts[worst]:.0f} "
+            f"of a kind instead of {mean[worst]:.0f} +- {var[worst].sqrt():.0f}"
+        )
