@@ -1,31 +1,47 @@
 """Options to a running BaseEnv.
 
-In: `EnvConfig`. Out: a function ``seed -> BaseEnv``. The only module that knows what runs an
-environment; must not know TorchRL.
+In: `EnvConfig`. Out: a function ``seed -> BaseEnv``. The only module that knows what runs an environment
+(with `link`, which knows how players are talked to); must not know TorchRL.
 """
 
 from __future__ import annotations
 
 import importlib
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mlagents_envs.base_env import BaseEnv
-
 from mappo_unity.config import Backend, ConfigError, EnvConfig
+from mappo_unity.protobuf import install
+
+install()
+
+from mlagents_envs.base_env import BaseEnv  # noqa: E402
 
 MakeEnv = Callable[[int], BaseEnv]
 
+EDITOR_PORT = 5004
+"""Port on which Unity's Editor looks for a trainer."""
+PLAYER_STRIDE = 100_003
+"""Player n of several starts from the seed plus n times this (modulo 2^31)."""
 
-def make_env_function(cfg: EnvConfig) -> MakeEnv:
+
+def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv:
     """Return the function that opens the environment for a seed.
+
+    Args:
+        log_folder: where players write their logs, unless env.player_logs says; None: a temporary folder.
 
     Raises:
         ConfigError: the options name nothing that can be opened.
     """
-    return {Backend.embedded: _embedded, Backend.custom: _custom}[cfg.backend](cfg)
+    if cfg.backend is Backend.embedded:
+        return _embedded(cfg)
+    if cfg.backend is Backend.custom:
+        return _custom(cfg)
+    return _players(cfg, log_folder)
 
 
 def _embedded(cfg: EnvConfig) -> MakeEnv:
@@ -37,8 +53,101 @@ def _embedded(cfg: EnvConfig) -> MakeEnv:
     return lambda seed: make_scene(cfg.name, seed=seed, **params)
 
 
+def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
+    from mappo_unity.link.client import PlayerOptions, UnityPlayer
+    from mappo_unity.link.restarts import RestartingPlayer
+    from mappo_unity.link.several import SeveralPlayers
+
+    executable = find_player(cfg)
+    folder = _log_folder(cfg, log_folder)
+
+    def options(number: int) -> PlayerOptions:
+        return PlayerOptions(
+            executable,
+            folder / f"Player-{number}.log",
+            port=cfg.port or EDITOR_PORT if cfg.backend is Backend.editor else 0,
+            timeout_s=cfg.timeout_s,
+            arguments=list(cfg.player_args),
+            no_graphics=cfg.no_graphics,
+            num_areas=cfg.num_areas or 1,
+            parameters={name: float(value) for name, value in cfg.params.items()},
+            engine=_engine(cfg),
+        )
+
+    def start(number: int, seed: int) -> RestartingPlayer:
+        name = f"player {number}" if cfg.num_players > 1 else _describe(cfg)
+        first = (seed + PLAYER_STRIDE * number) % 2**31
+        return RestartingPlayer(lambda s: UnityPlayer(options(number), s), first, cfg.max_restarts, name)
+
+    def make(seed: int) -> BaseEnv:
+        players: list[RestartingPlayer] = []
+        try:
+            for number in range(cfg.num_players):
+                players.append(start(number, seed))
+            for player in players:
+                player.connect()
+        except BaseException:
+            for player in players:
+                player.close()
+            raise
+        return players[0] if cfg.num_players == 1 else SeveralPlayers(players)
+
+    return make
+
+
+def find_player(cfg: EnvConfig) -> Path | None:
+    """Return the executable that the options name; None for the Editor.
+
+    Raises:
+        ConfigError: there is no such player or registry entry.
+    """
+    from mappo_unity.link.process import find_executable
+
+    if cfg.backend is Backend.editor:
+        return None
+    if cfg.backend is Backend.registry:
+        from mappo_unity.link.registry import fetch_player
+
+        return fetch_player(cfg.registry, cfg.registry_entry or cfg.name)
+    return find_executable(str(cfg.file_name))
+
+
+def _engine(cfg: EnvConfig) -> dict[str, Any]:
+    return {
+        "width": cfg.screen_width,
+        "height": cfg.screen_height,
+        "quality_level": cfg.quality_level,
+        "time_scale": cfg.time_scale,
+        "target_frame_rate": cfg.target_frame_rate,
+    }
+
+
+def _log_folder(cfg: EnvConfig, log_folder: Path | None) -> Path:
+    if cfg.player_logs is not None:
+        folder = Path(cfg.player_logs)
+    elif log_folder is not None:
+        folder = log_folder
+    else:
+        folder = Path(tempfile.mkdtemp(prefix="mappo-unity-players-"))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"the folder {folder} for players' logs cannot be made: {error.strerror}; choose another with "
+            "env.player_logs"
+        ) from error
+    return folder.absolute()
+
+
+def _describe(cfg: EnvConfig) -> str:
+    return {
+        Backend.editor: "env.backend=editor",
+        Backend.registry: f"registry entry {cfg.registry_entry or cfg.name}",
+    }.get(cfg.backend, f"env.file_name={cfg.file_name}")
+
+
 def _custom(cfg: EnvConfig) -> MakeEnv:
-    factory = _load_factory(str(cfg.factory))
+    factory = load_factory(str(cfg.factory))
 
     def make(seed: int) -> BaseEnv:
         try:
@@ -58,7 +167,8 @@ def _custom(cfg: EnvConfig) -> MakeEnv:
     return make
 
 
-def _load_factory(path: str) -> Callable[..., Any]:
+def load_factory(path: str) -> Callable[..., Any]:
+    """Return the function that package.module:function names; raises ConfigError."""
     module_name, _, function_name = path.partition(":")
     if str(Path.cwd()) not in sys.path:  # as `python -m` does: modules beside the user count
         sys.path.insert(0, str(Path.cwd()))

@@ -1,0 +1,316 @@
+"""One running player as a BaseEnv, from the trainer's side.
+
+In: `PlayerOptions` and a seed. Out: DecisionSteps and TerminalSteps. Differs from
+mlagents_envs.environment.UnityEnvironment in that it listens on loopback only, takes a port that the system
+gives, decodes without a loop over numbers, refuses numbers that are not finite, and says what failed and
+where the log is. A failure raises `PlayerFailure`, after which the player is gone; `restarts` starts another.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mlagents_envs import __version__ as MLAGENTS_VERSION
+from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
+from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
+from mlagents_envs.side_channel import SideChannel
+from mlagents_envs.side_channel.engine_configuration_channel import EngineConfigurationChannel
+from mlagents_envs.side_channel.environment_parameters_channel import EnvironmentParametersChannel
+from mlagents_envs.side_channel.side_channel_manager import SideChannelManager
+
+from mappo_unity.config import ConfigError
+from mappo_unity.link import decode, messages
+from mappo_unity.link.decode import ActionEncoder, BehaviorDecoder, MalformedMessage, behavior_spec
+from mappo_unity.link.messages import STATUS_OK
+from mappo_unity.link.process import PlayerProcess
+from mappo_unity.link.server import Link, LinkTimeout
+
+CLOSE_S = 5.0  # how long a player may take to leave before it is killed
+
+logger = logging.getLogger(__name__)
+
+
+class PlayerFailure(RuntimeError):
+    """A player crashed, hung, left or sent nonsense; the message names its log."""
+
+
+class ProtocolMismatch(PlayerFailure, ConfigError):
+    """The player speaks another version of the protocol."""
+
+
+@dataclass
+class PlayerOptions:
+    """How to start a player; `executable` None waits for the Unity Editor on `port`."""
+
+    executable: Path | None
+    log_file: Path
+    port: int = 0
+    timeout_s: float = 60.0
+    arguments: list[str] = field(default_factory=list)
+    no_graphics: bool = False
+    num_areas: int = 1
+    parameters: dict[str, float] = field(default_factory=dict)
+    engine: dict[str, Any] = field(default_factory=dict)
+    """Arguments of EngineConfigurationChannel.set_configuration_parameters."""
+
+
+class UnityPlayer(BaseEnv):
+    """Start a player (or wait for the Editor), connect, and step it.
+
+    The constructor only starts it; `connect` waits for it, so several players start side by side. A step may
+    be split likewise: `send_step` hands the actions over, `receive` waits for the result.
+
+    Args:
+        options: how to start it.
+        seed: of the player's random numbers.
+        side_channels: further ones.
+    """
+
+    def __init__(
+        self, options: PlayerOptions, seed: int = 0, side_channels: list[SideChannel] | None = None
+    ) -> None:
+        self.options, self.seed = options, seed
+        parameters, engine = EnvironmentParametersChannel(), EngineConfigurationChannel()
+        engine.set_configuration_parameters(**options.engine)
+        for name, value in options.parameters.items():
+            parameters.set_float_parameter(name, value)
+        self._channels = SideChannelManager([parameters, engine, *(side_channels or [])])
+        self._decoders: dict[str, BehaviorDecoder] = {}
+        self._encoders: dict[str, ActionEncoder] = {}
+        self._steps: dict[str, tuple[DecisionSteps, TerminalSteps]] = {}
+        self._actions: dict[str, ActionTuple] = {}
+        self._open = True
+        self._was_reset = False
+        self.handshake: Any = None
+        """The player's UnityRLInitializationOutputProto, once connected."""
+        self.process: PlayerProcess | None = None
+        """The player's process; None for the Editor."""
+        self._link = Link(options.port)
+        if options.executable is not None:
+            try:
+                self.process = PlayerProcess(options.executable, self._arguments(), options.log_file)
+            except BaseException:
+                self._link.close()
+                raise
+
+    # ---- connection ---------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Wait for the player and shake hands.
+
+        Raises:
+            PlayerFailure: it did not come, left, or sent nonsense.
+            ProtocolMismatch: it speaks another version; also a ConfigError.
+        """
+        if self.process is None:
+            logger.warning(
+                "waiting %g s for the Unity Editor on port %d: press Play",
+                self.options.timeout_s,
+                self._link.port,
+            )
+        output = self._receive()
+        self.handshake = output.rl_initialization_output
+        version = self.handshake.communication_version
+        if version.split(".")[0] != messages.API_VERSION.split(".")[0]:
+            error = ProtocolMismatch(
+                f"{self._name()} speaks version {version!r} of the ML-Agents protocol (package "
+                f"{self.handshake.package_version or 'unknown'}), this trainer {messages.API_VERSION}; the "
+                f"first numbers must agree: build it with com.unity.ml-agents 2.0 or later{self._log_hint()}"
+            )
+            self.close()
+            raise error
+        self._reply(decode.initialization(self.seed, self.options.num_areas, MLAGENTS_VERSION))
+        self._receive()  # the player's empty message: it waits for the first command
+
+    def send_step(self) -> None:
+        """Hand the actions over and let the player go on; agents without an action act with zeros."""
+        if not self._was_reset:
+            return self.send_reset()
+        actions = {}
+        for name, (decision, _) in self._steps.items():
+            if len(decision):
+                action = self._actions.get(name)
+                if action is None:
+                    action = self._decoders[name].spec.action_spec.empty_action(len(decision))
+                actions[name] = self._encoders[name].encode(action)
+        self._send(actions, messages.STEP)
+
+    def send_reset(self) -> None:
+        """Tell the player to reset its scene."""
+        self._was_reset = True
+        self._send({}, messages.RESET)
+
+    def receive(self) -> None:
+        """Wait for the result of `send_step` or `send_reset`.
+
+        Raises:
+            PlayerFailure: the player crashed, hung, left or sent nonsense.
+        """
+        output = self._receive()
+        try:
+            self._add_behaviors(output)
+            infos = output.rl_output.agentInfos
+            self._steps = {
+                name: decoder.decode(infos[name].value if name in infos else ())
+                for name, decoder in self._decoders.items()
+            }
+            if output.rl_output.side_channel:
+                self._channels.process_side_channel_message(output.rl_output.side_channel)
+        except (MalformedMessage, UnityEnvironmentException, ValueError, IndexError) as error:
+            raise self._failure(f"sent a malformed message: {error}") from error
+
+    # ---- BaseEnv ------------------------------------------------------------------------------------------
+
+    @property
+    def behavior_specs(self) -> BehaviorMapping:
+        """Return the specs of the behaviors that have shown up so far."""
+        return BehaviorMapping({name: decoder.spec for name, decoder in self._decoders.items()})
+
+    def reset(self) -> None:
+        """Reset the scene; the next steps are its first."""
+        self.send_reset()
+        self.receive()
+
+    def step(self) -> None:
+        """Go on until some agent reports."""
+        self.send_step()
+        self.receive()
+
+    def get_steps(self, behavior_name: str) -> tuple[DecisionSteps, TerminalSteps]:
+        """Return the decision and terminal steps of the last result."""
+        self._known(behavior_name)
+        return self._steps[behavior_name]
+
+    def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
+        """Set the actions of all agents in the last decision steps, in their order."""
+        spec = self._known(behavior_name).spec.action_spec
+        count = len(self._steps[behavior_name][0])
+        self._actions[behavior_name] = spec._validate_action(action, count, behavior_name)
+
+    def set_action_for_agent(self, behavior_name: str, agent_id: int, action: ActionTuple) -> None:
+        """Set the action of one agent in the last decision steps."""
+        spec = self._known(behavior_name).spec.action_spec
+        decision = self._steps[behavior_name][0]
+        if agent_id not in decision.agent_id_to_index:
+            raise IndexError(f"agent {agent_id} of {behavior_name} did not request a decision")
+        row = decision.agent_id_to_index[agent_id]
+        action = spec._validate_action(action, 1, behavior_name)
+        stored = self._actions.setdefault(behavior_name, spec.empty_action(len(decision)))
+        stored.continuous[row], stored.discrete[row] = action.continuous[0], action.discrete[0]
+
+    def close(self) -> None:
+        """Tell the player to leave, see that it does, and free the port; again is allowed."""
+        self._end(CLOSE_S)
+
+    # ---- below --------------------------------------------------------------------------------------------
+
+    def _arguments(self) -> list[str]:
+        options = self.options
+        arguments = ["-nographics", "-batchmode"] if options.no_graphics else []
+        arguments += ["--mlagents-port", str(self._link.port)]
+        if not any(argument.lower() == "-logfile" for argument in options.arguments):
+            arguments += ["-logFile", str(options.log_file)]
+        return arguments + options.arguments
+
+    def _send(self, actions: dict[str, bytes], command: int) -> None:
+        if not self._open:
+            raise UnityEnvironmentException(f"{self._name()} is closed")
+        channels = bytes(self._channels.generate_side_channel_messages())
+        self._reply(decode.rl_input(actions, command, channels))
+        self._actions.clear()
+
+    def _reply(self, unity_input: bytes) -> None:
+        self._link.reply(messages.message(STATUS_OK, unity_input=unity_input))
+
+    def _receive(self) -> Any:
+        from google.protobuf.message import DecodeError
+
+        begin = time.monotonic()
+        try:
+            data = self._link.receive(self.options.timeout_s, self._check_alive)
+        except LinkTimeout as error:
+            raise self._failure(self._silence(time.monotonic() - begin)) from error
+        try:
+            answer = messages.parse(data)
+        except DecodeError as error:
+            raise self._failure(f"sent a malformed message of {len(data)} bytes ({error})") from error
+        if answer.header.status != STATUS_OK:
+            raise self._failure(f"closed the connection{_quoted(answer.header.message)}")
+        return answer.unity_output
+
+    def _check_alive(self) -> None:
+        how = self.process.ended() if self.process is not None else None
+        if how is not None:
+            when = "while it started" if self.handshake is None else "while the training ran"
+            raise self._failure(f"ended {when}: {how}")
+
+    def _silence(self, waited_s: float) -> str:
+        if self.handshake is not None:
+            return f"did not answer within env.timeout_s={self.options.timeout_s:g}"
+        limit = f"within env.timeout_s={self.options.timeout_s:g}"
+        if self.process is None:
+            return (
+                f"did not connect to port {self._link.port} {limit}: press Play in a scene whose agents have "
+                "Behavior Type Default, and see that no other training is on that port"
+            )
+        return (
+            f"did not connect {limit}: it may need env.no_graphics=true on a machine without a display, wait "
+            "for a user, or hold no agent with Behavior Type Default"
+        )
+
+    def _add_behaviors(self, output: Any) -> None:
+        for brain in output.rl_initialization_output.brain_parameters:
+            infos = output.rl_output.agentInfos
+            name = brain.brain_name
+            if name in self._decoders or name not in infos or not infos[name].value:
+                continue
+            spec = behavior_spec(brain, infos[name].value[0])
+            self._decoders[name] = BehaviorDecoder(name, spec)
+            self._encoders[name] = ActionEncoder(spec, old=not self.handshake.capabilities.hybridActions)
+
+    def _known(self, name: str) -> BehaviorDecoder:
+        if name not in self._decoders:
+            raise UnityActionException(f"there is no behavior {name!r}; there are {list(self._decoders)}")
+        return self._decoders[name]
+
+    def _failure(self, what: str) -> PlayerFailure:
+        """End the player and return the error that says why."""
+        error = PlayerFailure(f"{self._name()} {what}{self._log_hint()}")
+        self._end(0.0)
+        return error
+
+    def _end(self, patience_s: float) -> None:
+        if not self._open:
+            return
+        self._open = False
+        self._link.say_quit()
+        if self.process is not None:
+            if patience_s:
+                self.process.wait(patience_s)
+            self.process.kill()
+        self._link.close()
+
+    def _name(self) -> str:
+        return "the Unity Editor" if self.process is None else f"player {self.process.executable.name}"
+
+    def _log_hint(self) -> str:
+        if self.process is None:
+            return ""
+        files = [f for f in (self.options.log_file, self.options.log_file.with_suffix(".out")) if _filled(f)]
+        return f"; its log: {files[0] if files else self.options.log_file}"
+
+
+MakePlayer = Callable[[int], UnityPlayer]
+
+
+def _filled(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
+
+
+def _quoted(text: str) -> str:
+    return f": {text}" if text else ""

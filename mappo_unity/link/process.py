@@ -1,0 +1,125 @@
+"""Players as processes: find the executable, start it, end it, and leave none behind.
+
+In: `file_name` as ML-Agents takes it, arguments. Out: a `PlayerProcess`. Knows nothing of the protocol.
+
+A player must not outlive its trainer, however that ends. On Linux the kernel kills it with the thread that
+started it (prctl PR_SET_PDEATHSIG), so one thread that lives as long as the process starts them all; on other
+systems a player leaves when its connection breaks.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+
+from mappo_unity.config import ConfigError
+
+_DIE_WITH_PARENT = """
+import ctypes, os, sys
+ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
+if os.getppid() != int(sys.argv[1]):
+    os._exit(1)
+os.execv(sys.argv[2], sys.argv[2:])
+"""
+
+
+def find_executable(file_name: str, option: str = "env.file_name") -> Path:
+    """Return the executable that `file_name` (with or without its extension) means on this system.
+
+    Raises:
+        ConfigError: there is none, or it may not be executed; says what was looked for.
+    """
+    from mlagents_envs.env_utils import validate_environment_path
+
+    found = validate_environment_path(os.path.expanduser(file_name))
+    if found is None or not Path(found).is_file():
+        kinds = {"darwin": ".app", "win32": ".exe"}.get(sys.platform, ".x86_64, .x86, or no extension")
+        raise ConfigError(
+            f"{option}={file_name}: no Unity player is there; looked for {Path(file_name).absolute()} with "
+            f"{kinds}; give the path of the built player{_beside(Path(file_name))}"
+        )
+    if not os.access(found, os.X_OK):
+        raise ConfigError(f"{option}={file_name}: {found} is not executable; run: chmod +x {found}")
+    return Path(found).absolute()
+
+
+class PlayerProcess:
+    """A running player, in a session of its own.
+
+    `log_file`: what it prints comes here too, after what it logged before.
+    """
+
+    def __init__(self, executable: Path, arguments: list[str], log_file: Path) -> None:
+        self.executable, self.log_file = executable, log_file
+        command = [str(executable), *arguments]
+        if sys.platform.startswith("linux"):
+            command = [sys.executable, "-S", "-E", "-c", _DIE_WITH_PARENT, str(os.getpid()), *command]
+        log_file.parent.mkdir(parents=True, exist_ok=True)
+        self._process = _starter(os.getpid()).submit(_start, command, log_file.with_suffix(".out")).result()
+
+    @property
+    def pid(self) -> int:
+        """Id of the process."""
+        return self._process.pid
+
+    def ended(self) -> str | None:
+        """Say how the process ended; None while it runs."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        if code >= 0:
+            return f"exit code {code}"
+        try:
+            return f"killed by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"killed by signal {-code}"
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for its end; tell whether it came in time."""
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def kill(self) -> None:
+        """End it at once, with every process that it started."""
+        try:
+            if hasattr(os, "killpg"):
+                os.killpg(self.pid, signal.SIGKILL)
+            else:
+                self._process.kill()
+        except (ProcessLookupError, PermissionError):
+            pass  # it has ended
+        self._process.wait()
+
+
+@cache
+def _starter(pid: int) -> ThreadPoolExecutor:
+    """Return the one thread of this process that starts players."""
+    return ThreadPoolExecutor(1, "player-starter")
+
+
+def _start(command: list[str], output: Path) -> subprocess.Popen:
+    with output.open("wb") as file:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # Ctrl-C is the trainer's business
+        )
+
+
+def _beside(path: Path) -> str:
+    """Name what lies in the folder of a path that does not exist."""
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        return f" (there is no folder {folder})"
+    names = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
+    return f" ({folder} holds {', '.join(names[:10]) or 'nothing'}{', ...' if len(names) > 10 else ''})"

@@ -1,0 +1,119 @@
+"""The trainer's end of the connection: a gRPC server on the loopback address that one player calls.
+
+In: answers as bytes. Out: the player's requests as bytes, with time-outs. Other addresses of the machine are
+not listened on. Knows nothing of what the bytes mean.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import grpc
+
+from mappo_unity.config import ConfigError
+from mappo_unity.link.messages import METHOD, OPTIONS, STATUS_QUIT, message
+
+ADDRESS = "127.0.0.1"
+POLL_S = 0.1  # how often the player's process is looked at while nothing comes
+
+
+class LinkTimeout(Exception):
+    """The player sent nothing in time."""
+
+
+class Link:
+    """Listen for one player.
+
+    A player's request is answered by `reply`; then `receive` waits for its next one. The system picks a free
+    port and keeps it (port 0), so no two links ever fight for one.
+
+    Attributes: `port`, the port that is listened on.
+    Raises ConfigError: the port given is in use.
+    """
+
+    def __init__(self, port: int = 0) -> None:
+        self._requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._peer: str | None = None
+        self._closing = False
+        self._server = grpc.server(
+            ThreadPoolExecutor(2, "player"), options=(("grpc.so_reuseport", 0), *OPTIONS)
+        )
+        self._server.add_generic_rpc_handlers((_Handler(self._exchange),))
+        try:
+            self.port = self._server.add_insecure_port(f"{ADDRESS}:{port}")
+        except RuntimeError:
+            self.port = 0
+        if not self.port:
+            raise ConfigError(
+                f"port {port} of {ADDRESS} is in use: another training, or a game started by hand, holds it; "
+                "end that one, or choose another port (env.port) on both sides"
+            )
+        self._server.start()
+
+    def receive(self, timeout_s: float, check: Callable[[], None] = lambda: None) -> bytes:
+        """Return the player's next request.
+
+        Args:
+            timeout_s: seconds to wait.
+            check: called now and then while waiting; may raise to end it.
+
+        Raises:
+            LinkTimeout: nothing came.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            left = deadline - time.monotonic()
+            try:
+                return self._requests.get(timeout=max(0.0, min(POLL_S, left)))
+            except queue.Empty:
+                check()
+                if left <= 0:
+                    raise LinkTimeout(f"nothing came for {timeout_s:g} s") from None
+
+    def reply(self, answer: bytes) -> None:
+        """Answer the request received last."""
+        self._answers.put(answer)
+
+    def say_quit(self) -> None:
+        """Tell the player to leave, now or when it calls next."""
+        self._closing = True
+        self._answers.put(message(STATUS_QUIT))
+
+    def close(self) -> None:
+        """Stop listening; the port is free again."""
+        self.say_quit()
+        self._server.stop(0).wait(5)
+
+    def _exchange(self, request: bytes, context: Any) -> bytes:
+        """Run in a thread of gRPC: hand a request over and wait for its answer."""
+        peer = context.peer()
+        if self._peer is None:
+            self._peer = peer
+        elif peer != self._peer:
+            context.abort(grpc.StatusCode.FAILED_PRECONDITION, "this trainer has a player already")
+        if self._closing:
+            return message(STATUS_QUIT)
+        self._requests.put(request)
+        while True:
+            try:
+                return self._answers.get(timeout=5)
+            except queue.Empty:
+                # A trainer that ended without closing must not be held back by this thread.
+                if self._closing or not threading.main_thread().is_alive():
+                    return message(STATUS_QUIT)
+
+
+class _Handler(grpc.GenericRpcHandler):
+    """Route the one method, without (de)serializers: bytes in, bytes out."""
+
+    def __init__(self, exchange: Callable[[bytes, Any], bytes]) -> None:
+        self._method = grpc.unary_unary_rpc_method_handler(exchange)
+
+    def service(self, handler_call_details: Any) -> Any:
+        return self._method if handler_call_details.method == METHOD else None

@@ -1,0 +1,276 @@
+"""mappo-player: serve a scene as if it were a built Unity player.
+
+In: a scene's name (or package.module:function) and the arguments that ML-Agents passes to players. Out: the
+gRPC client's side of the ML-Agents protocol (API 1.5.0) on a port of this machine, until the trainer closes
+or goes away. Order of messages: RpcCommunicator.cs of com.unity.ml-agents. Must not import torch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TextIO
+
+from mappo_unity.config import ConfigError
+from mappo_unity.protobuf import install
+
+install()
+
+import grpc  # noqa: E402
+import numpy as np  # noqa: E402
+from mlagents_envs.base_env import BaseEnv  # noqa: E402
+
+from mappo_unity import __version__  # noqa: E402
+from mappo_unity.link import encode, messages, side_channels  # noqa: E402
+from mappo_unity.link.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
+
+EDITOR_PORT = 5004
+"""Port on which a trainer waits for the Editor, used when no --mlagents-port is given."""
+CONNECT_TIMEOUT_S = 60.0
+"""How long a player looks for its trainer."""
+
+MakeEnv = Callable[[int, "int | None"], BaseEnv]
+Log = Callable[[str], None]
+
+
+class PlayerError(RuntimeError):
+    """The trainer asked for something that cannot be done."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run mappo-player; return the exit code: 0 when the trainer closed, 1 after an error, 2 for options.
+
+    Raises:
+        ConfigError: a mistake in the options.
+    """
+    options = _parser().parse_known_args(arguments)
+    known, ignored = options
+    if known.scene == "build":
+        from mappo_unity.player_build import build
+
+        if len(ignored) < 2:
+            raise ConfigError(
+                "mappo-player build needs a scene and a folder: mappo-player build 3DBall builds"
+            )
+        print(build(ignored[0], ignored[1], ignored[2:], known))
+        return 0
+    make_env = env_function(known.scene, known.num_areas, dict(map(_parameter, known.param)))
+    with _open_log(known.log_file) as file:
+
+        def log(line: str) -> None:
+            print(f"{time.strftime('%H:%M:%S')} {line}", file=file, flush=True)
+
+        log(f"mappo-player {__version__}: {known.scene}, port {known.port}, protocol {messages.API_VERSION}")
+        if ignored:
+            log(f"accepted and without effect: {' '.join(ignored)}")
+        return serve(Player(make_env, known.scene, log, png=not known.no_png), known.port, log)
+
+
+def env_function(scene: str, num_areas: int | None = None, params: dict[str, float] | None = None) -> MakeEnv:
+    """Return the function (seed, number of areas or None) -> BaseEnv of a scene or a factory.
+
+    `num_areas` and `params` given here win over what the trainer says.
+    Raises ConfigError: there is no such scene.
+    """
+    fixed: dict[str, Any] = dict(params or {}) | ({} if num_areas is None else {"num_areas": num_areas})
+    if ":" in scene:
+        from mappo_unity.backend import load_factory
+
+        factory = load_factory(scene)
+        return lambda seed, areas: factory(seed=seed, **fixed)
+    from mappo_unity.scenes import make_scene, scene_names
+
+    if scene not in scene_names():
+        raise ConfigError(
+            f"there is no scene {scene!r}; choices: {', '.join(scene_names())}, or package.module:function"
+        )
+    return lambda seed, areas: make_scene(
+        scene, seed=seed, **({} if areas is None else {"num_areas": areas}) | fixed
+    )
+
+
+def serve(player: Player, port: int, log: Log) -> int:
+    """Connect to the trainer on a port of this machine and play until it closes; return the exit code."""
+    channel = grpc.insecure_channel(f"localhost:{port}", options=messages.OPTIONS)
+    try:
+        grpc.channel_ready_future(channel).result(timeout=CONNECT_TIMEOUT_S)
+    except grpc.FutureTimeoutError:
+        log(f"no trainer listens on port {port} of this machine")
+        return 1
+    exchange = channel.unary_unary(messages.METHOD)
+    try:
+        player.play(exchange)
+        log("the trainer closed")
+        return 0
+    except grpc.RpcError as error:
+        log(f"the connection to the trainer is gone: {error.code()}")
+        return 1
+    except Exception as error:
+        log(traceback.format_exc())
+        _say_goodbye(exchange, f"{type(error).__name__}: {error}")
+        return 1
+    finally:
+        channel.close()
+
+
+@dataclass
+class Player:
+    """Answer a trainer's messages with an environment's steps.
+
+    `make_env` is called with the seed and, where the trainer asks for several areas, their number.
+    """
+
+    make_env: MakeEnv
+    scene: str
+    log: Log = lambda line: None
+    png: bool = True
+    env: BaseEnv = field(init=False)
+    encoders: dict[str, encode.BehaviorEncoder] = field(init=False, default_factory=dict)
+
+    def play(self, exchange: Callable[[bytes], bytes]) -> None:
+        """Shake hands, then advance the environment message by message until the trainer quits.
+
+        Raises:
+            PlayerError: the trainer speaks another version, or its actions do not fit.
+        """
+        hello = encode.initialization(self.scene, __version__)
+        answer = messages.parse(
+            exchange(messages.message(STATUS_OK, unity_output=messages.delimited(2, hello)))
+        )
+        if answer.header.status != STATUS_OK:
+            return
+        self._open(answer.unity_input.rl_initialization_input)
+        answer = messages.parse(exchange(messages.message(STATUS_OK)))
+        try:
+            while answer.header.status == STATUS_OK and answer.HasField("unity_input"):
+                output = self.advance(answer.unity_input.rl_input)
+                answer = messages.parse(exchange(messages.message(STATUS_OK, unity_output=output)))
+        finally:
+            self.env.close()
+
+    def advance(self, rl_input: Any) -> bytes:
+        """Apply a trainer's input to the environment; return the UnityOutputProto of its next steps."""
+        if rl_input.side_channel:
+            self._read_side_channels(rl_input.side_channel)
+        if rl_input.command == messages.RESET:
+            self.env.reset()
+        else:
+            for name, rows in rl_input.agent_actions.items():
+                self._act(name, rows.value)
+            self.env.step()
+        return self._output()
+
+    def _open(self, parameters: Any) -> None:
+        version = parameters.communication_version
+        if version.split(".")[0] != messages.API_VERSION.split(".")[0]:
+            raise PlayerError(f"the trainer speaks protocol {version!r}, this player {messages.API_VERSION}")
+        # One area is what clients send when nobody chose: then the scene has as many as in Unity.
+        areas = parameters.num_areas if parameters.num_areas > 1 else None
+        self.env = self.make_env(parameters.seed & 0x7FFFFFFF, areas)
+        self.log(
+            f"connected to mlagents_envs {parameters.package_version}, protocol {version}; "
+            f"seed {parameters.seed}, areas {areas or 'as in Unity'}"
+        )
+
+    def _act(self, name: str, values: Sequence[Any]) -> None:
+        if name not in self.encoders:
+            raise PlayerError(f"actions for behavior {name!r}, which no agent has shown")
+        asked = len(self.env.get_steps(name)[0])
+        if len(values) != asked:
+            raise PlayerError(f"{len(values)} actions for {asked} agents of {name!r} that asked")
+        if asked:
+            self.env.set_actions(name, encode.decode_actions(self.encoders[name].spec, values))
+
+    def _output(self) -> bytes:
+        agent_infos, came_up = {}, []
+        specs = self.env.behavior_specs
+        for name in specs:
+            decision, terminal = self.env.get_steps(name)
+            if not len(decision) and not len(terminal):
+                continue
+            if name not in self.encoders:
+                self.encoders[name] = encode.BehaviorEncoder(name, specs[name], self.png)
+                came_up.append(self.encoders[name].brain_parameters())
+            agent_infos[name] = self.encoders[name].encode(decision, terminal)
+        hello = encode.initialization(self.scene, __version__, came_up) if came_up else None
+        return encode.output(agent_infos, hello)
+
+    def _read_side_channels(self, data: bytes) -> None:
+        for channel, content in side_channels.split(data):
+            if channel == side_channels.PARAMETERS:
+                self._set_parameter(*side_channels.read_parameter(content))
+            elif channel == side_channels.ENGINE:
+                self.log(f"without effect here: {side_channels.read_engine_setting(content)}")
+            elif channel != side_channels.ANALYTICS:
+                self.log(f"a message on side channel {channel}, which this player does not know")
+
+    def _set_parameter(self, name: str, value: float) -> None:
+        setter = getattr(self.env, "set_parameter", None)
+        try:
+            if setter is None:
+                raise ConfigError("the environment takes no parameters")
+            setter(name, value)
+            self.log(f"environment parameter {name} = {value:g}")
+        except ConfigError as error:  # Unity accepts any name, too
+            self.log(f"environment parameter {name} = {value:g} is ignored: {error}")
+
+
+def _say_goodbye(exchange: Callable[..., bytes], text: str) -> None:
+    try:
+        exchange(messages.message(STATUS_QUIT, text=text), timeout=5)
+    except grpc.RpcError:
+        pass  # nobody is there to hear it
+
+
+def _open_log(path: str | None) -> TextIO:
+    if path is None or path == "-":
+        return open(sys.stdout.fileno(), "w", closefd=False, encoding="utf-8")
+    try:
+        return open(path, "w", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"-logFile {path} cannot be written: {error.strerror}") from error
+
+
+def _parameter(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        number = np.nan
+    if not name or not np.isfinite(number):
+        raise ConfigError(f"--param {text} is not of the form NAME=NUMBER")
+    return name, number
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> Any:
+        raise ConfigError(f"{message}; {self.format_usage().strip()}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="mappo-player",
+        usage="mappo-player SCENE [--mlagents-port N] [options]   |   mappo-player build SCENE DIR [options]",
+        description="Serve a scene as a Unity player, to a trainer that listens on a port of this machine. "
+        "Other arguments of Unity players (-nographics, -batchmode ...) are accepted and have no effect.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("scene", metavar="SCENE", help="a scene's name, or package.module:function")
+    parser.add_argument("--mlagents-port", dest="port", type=int, default=EDITOR_PORT, metavar="N")
+    parser.add_argument("-logFile", "-logfile", dest="log_file", metavar="PATH", help="log; default stdout")
+    parser.add_argument("--num-areas", type=int, metavar="N", help="areas, whatever the trainer asks for")
+    parser.add_argument("--param", action="append", default=[], metavar="NAME=NUMBER")
+    parser.add_argument("--no-png", action="store_true", help="send pictures as floats")
+    return parser
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except ConfigError as mistake:
+        print(f"mappo-player: {mistake}", file=sys.stderr)
+        sys.exit(2)

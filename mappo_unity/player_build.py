@@ -1,0 +1,54 @@
+"""mappo-player build: an executable that looks to ML-Agents like a built Unity player.
+
+In: a scene and a folder. Out: ``FOLDER/SCENE.x86_64`` (macOS: ``SCENE.app``), a script that starts
+mappo-player with this Python. Knows nothing of the protocol.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+from mappo_unity.config import ConfigError
+
+
+def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
+    """Write the executable of a scene; return its path.
+
+    Raises:
+        ConfigError: no such scene, a folder that cannot be written, or a platform without scripts.
+    """
+    from mappo_unity.player import env_function
+
+    if rest:
+        raise ConfigError(f"mappo-player build: unknown arguments {' '.join(rest)}")
+    env_function(scene)
+    name = scene.rpartition(":")[2] or scene
+    path = _executable(Path(folder), name)
+    command = [sys.executable, "-m", "mappo_unity.player", scene]
+    if options.num_areas is not None:
+        command += ["--num-areas", str(options.num_areas)]
+    for parameter in options.param:
+        command += ["--param", parameter]
+    if options.no_png:
+        command += ["--no-png"]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f'#!/bin/sh\nexec {shlex.join(command)} "$@"\n', encoding="utf-8")
+        path.chmod(0o755)
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror}") from error
+    return path
+
+
+def _executable(folder: Path, name: str) -> Path:
+    if sys.platform == "win32":
+        raise ConfigError(
+            "mappo-player build writes a script, which ML-Agents cannot start on Windows; run mappo-player "
+            f"{name} by hand and train with env.backend=editor"
+        )
+    if sys.platform == "darwin":
+        return folder / f"{name}.app" / "Contents" / "MacOS" / name
+    return folder / f"{name}.x86_64"
