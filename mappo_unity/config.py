@@ -18,11 +18,18 @@ class ConfigError(ValueError):
     """A mistake in the options; the message names the option, its value and the rule."""
 
 
+class EnvironmentFailure(RuntimeError):
+    """An environment that ran has failed for good; the message says how, and where its log is."""
+
+
 class Backend(Enum):
     """What runs the environment."""
 
     embedded = "embedded"
     custom = "custom"
+    player = "player"
+    editor = "editor"
+    registry = "registry"
 
 
 class Activation(Enum):
@@ -89,13 +96,44 @@ class EnvConfig:
     name: str = "3DBall"
     """Name of the environment: a preset in conf/env, also the name of the run's folder."""
     backend: Backend = Backend.embedded
-    """What runs it: an embedded scene, or a simulator of your own (custom)."""
+    """What runs it: an embedded scene, a simulator of your own (custom), a built Unity player, the Unity
+    Editor, or a player that ML-Agents' registry names (registry)."""
     num_areas: Optional[int] = None
     """Copies of the playing area inside one environment; null: as many as the Unity scene has."""
     params: dict[str, Any] = field(default_factory=dict)
-    """Environment parameters (env.params.mass=2) of the scene, or arguments of env.factory."""
+    """Environment parameters (env.params.mass=2) of the scene or player, or arguments of env.factory."""
     factory: Optional[str] = None
     """With backend=custom: package.module:function, called as function(seed=..., **env.params)."""
+    file_name: Optional[str] = None
+    """With backend=player: path of the built Unity player, with or without its extension."""
+    registry: str = "default"
+    """With backend=registry: path or URL of a registry's YAML file, or default (ML-Agents' own)."""
+    registry_entry: Optional[str] = None
+    """With backend=registry: the entry to play; null: the one called env.name."""
+    num_players: int = 1
+    """Players that run side by side, their agents in one batch."""
+    max_restarts: int = 20
+    """Times that each player is started again in a run after it crashed, hung or sent nonsense."""
+    timeout_s: float = 60.0
+    """Seconds within which a player (or the Editor) must connect, and must answer."""
+    port: Optional[int] = None
+    """With backend=editor: the port to wait on; null: 5004, as in Unity. Players get free ports."""
+    time_scale: float = 20.0
+    """How much faster than real time a player runs; a high one may change its physics."""
+    quality_level: Optional[int] = None
+    """Unity's quality level; null: as built."""
+    screen_width: Optional[int] = None
+    """Width of a player's screen in pixels; null: as built."""
+    screen_height: Optional[int] = None
+    """Height of a player's screen in pixels; null: as built."""
+    target_frame_rate: Optional[int] = -1
+    """Frames a second that a player draws; -1: no limit, null: as built."""
+    no_graphics: bool = False
+    """Start players without graphics (machines without a display); cameras then see nothing."""
+    player_args: list[str] = field(default_factory=list)
+    """Further arguments of a player's command line."""
+    player_logs: Optional[str] = None
+    """Folder of the players' logs; null: players/ in the run's folder."""
     max_team_size: Optional[int] = None
     """Agent slots of a team; null: the largest team seen at the start."""
     max_teams: Optional[int] = None
@@ -109,6 +147,17 @@ class EnvConfig:
         _at_least("env.num_areas", self.num_areas, 1)
         _at_least("env.max_team_size", self.max_team_size, 1)
         _at_least("env.max_teams", self.max_teams, 1)
+        _at_least("env.num_players", self.num_players, 1)
+        _at_least("env.max_restarts", self.max_restarts, 0)
+        _above("env.timeout_s", self.timeout_s, 0)
+        _above("env.time_scale", self.time_scale, 0)
+        _at_least("env.quality_level", self.quality_level, 0)
+        _at_least("env.screen_width", self.screen_width, 1)
+        _at_least("env.screen_height", self.screen_height, 1)
+        _at_least("env.target_frame_rate", self.target_frame_rate, -1)
+        if self.port is not None:
+            _within("env.port", self.port, 1, 65535)
+        self._check_players()
         if self.backend is Backend.custom and not self.factory:
             raise ConfigError(
                 "env.factory is not given, but env.backend=custom needs it: "
@@ -116,6 +165,26 @@ class EnvConfig:
             )
         if self.factory is not None and self.factory.count(":") != 1:
             raise ConfigError(f"env.factory={self.factory!r} is not of the form package.module:function")
+
+    def _check_players(self) -> None:
+        if self.backend is Backend.player and not self.file_name:
+            raise ConfigError(
+                "env.file_name is not given, but env.backend=player needs it: the path of a built Unity "
+                "player, env.file_name=builds/Game (env.backend=editor trains in the Unity Editor instead)"
+            )
+        if (self.screen_width is None) != (self.screen_height is None):
+            raise ConfigError("env.screen_width and env.screen_height belong together: give both or neither")
+        if self.backend in (Backend.embedded, Backend.custom, Backend.editor) and self.num_players > 1:
+            raise ConfigError(
+                f"env.num_players={self.num_players} needs env.backend=player or registry; with "
+                f"env.backend={self.backend.value} there is one environment (env.num_areas makes it larger)"
+            )
+        if self.backend in (Backend.player, Backend.editor, Backend.registry):
+            for name, value in self.params.items():
+                if isinstance(value, bool) or not isinstance(value, (int, float)):
+                    raise ConfigError(
+                        f"env.params.{name}={value!r} must be a number: players take float parameters only"
+                    )
 
 
 @dataclass
