@@ -1,0 +1,288 @@
+"""Ray sensors of Unity ML-Agents: analytic sphere casts, vectorised, and their encoding.
+
+In: where agents stand and look, and the colliders. Out: travelled distances, and observations. Knows no
+scene. Rules: sensors of the component "RayPerceptionSensor" (alternating order, right first).
+
+Every cast broadcasts over leading axes; a sensor of N agents with R rays against M colliders uses
+[N, R, 1, 3] origins and directions against [N, 1, M, ...] or [M, ...] colliders and gives distances
+[N, R, M], inf where nothing is hit. Distance is the travel of the sphere's centre. A collider that the
+sphere overlaps at the start (or is nearer than `skip_gap`) is not reported, as the engine does; so an
+agent's own collider needs no special care.
+
+    eyes = RaySensor(tags=5, rays_per_side=2, max_degrees=70, length=12)
+    sensor = eyes.sensor("RayPerceptionSensor", stack=3)              # in the behavior
+    origin, direction = eyes.casts(position, yaw)                     # [N, 1, 1, 3], [N, R, 1, 3]
+    balls = cast_spheres(origin, direction, centres[:, None], radii + eyes.cast_radius)
+    walls = cast_upright_boxes(origin, direction, eyes.cast_radius, wall_centres, wall_halves, wall_yaws)
+    frame = eyes.encode(np.concatenate([balls, walls], axis=2), tags)  # float32 [N, eyes.size]
+
+For horizontal rays `cast_rectangles` is the same as `cast_upright_boxes` in two dimensions, and faster.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mappo_unity.scenes.specs import Sensor
+
+_TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class RaySensor:
+    """Describe a ray sensor (RayPerceptionSensorComponent3D); lengths in m, angles in degrees."""
+
+    tags: int
+    """Number of detectable tags."""
+    rays_per_side: int = 3
+    """Rays on each side, besides the one ahead."""
+    max_degrees: float = 70.0
+    """Angle of the outermost rays."""
+    length: float = 20.0
+    """Ray length."""
+    radius: float = 0.5
+    """Radius of the cast sphere, before scaling by the effective length."""
+    start_offset: float = 0.0
+    """Height of the start above the agent."""
+    end_offset: float = 0.0
+    """Height of the end above the agent (not above the start)."""
+    turn_degrees: float = 0.0
+    """Yaw of the sensor's object relative to the agent (180: a sensor that looks back)."""
+
+    @property
+    def num_rays(self) -> int:
+        """Return the number of rays."""
+        return 2 * self.rays_per_side + 1
+
+    @property
+    def size(self) -> int:
+        """Return the length of one frame: tags, miss flag and distance a ray."""
+        return self.num_rays * (self.tags + 2)
+
+    @property
+    def cast_length(self) -> float:
+        """Return the distance from start to end, by which distances are divided."""
+        return float(np.hypot(self.length, self.end_offset - self.start_offset))
+
+    @property
+    def cast_radius(self) -> float:
+        """Return the radius of the cast sphere."""
+        return self.radius * self.cast_length / self.length
+
+    @cached_property
+    def angles(self) -> np.ndarray:
+        """Return the rays' angles in rad, right positive: 0, d, -d, 2d, -2d, ... in the agent's frame."""
+        step = np.arange(1, self.rays_per_side + 1) * self.max_degrees / self.rays_per_side
+        return np.radians(np.concatenate([[0.0], np.stack([step, -step], 1).ravel()]) + self.turn_degrees)
+
+    def sensor(self, name: str, stack: int = 1) -> Sensor:
+        """Return the declaration of the sensor for a behavior."""
+        return Sensor(name, (self.size,), stack)
+
+    def casts(self, position: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return origins [N, 1, 1, 3] and unit directions [N, R, 1, 3] of the rays.
+
+        `position`: agents' origins [N, 3], x right, y up, z forward. `yaw`: [N] rad, clockwise from above.
+        """
+        heading = yaw[:, None] + self.angles
+        level, rise = self.length / self.cast_length, (self.end_offset - self.start_offset) / self.cast_length
+        direction = np.empty((*heading.shape, 1, 3))
+        direction[:, :, 0, 0] = np.sin(heading) * level
+        direction[:, :, 0, 1] = rise
+        direction[:, :, 0, 2] = np.cos(heading) * level
+        origin = position + (0.0, self.start_offset, 0.0)
+        return origin[:, None, None], direction
+
+    def encode(self, distance: np.ndarray, tags: np.ndarray) -> np.ndarray:
+        """Return one frame, float32 [N, size]: a ray's tag one-hot, 1 if it missed, distance / length.
+
+        `distance` [N, R, M] m; `tags` int [M] or [N, M]: the index of each collider's tag, -1: not listed.
+        """
+        count, rays, colliders = distance.shape
+        frame = np.zeros((count, rays, self.tags + 2), np.float32)
+        nearest = distance.argmin(axis=2)
+        travelled = np.take_along_axis(distance, nearest[..., None], 2)[..., 0] / self.cast_length
+        hit = travelled <= 1.0
+        frame[..., -1] = np.where(hit, travelled, 1.0)
+        frame[..., -2] = ~hit
+        tag = np.broadcast_to(tags, (count, colliders))[np.arange(count)[:, None], nearest]
+        listed = hit & (tag >= 0)
+        agent, ray = np.nonzero(listed)
+        frame[agent, ray, tag[listed]] = 1.0
+        return frame.reshape(count, -1)
+
+
+def cast_spheres(
+    origin: np.ndarray,
+    direction: np.ndarray,
+    centre: np.ndarray,
+    reach: np.ndarray | float,
+    skip_gap: float = 0.0,
+) -> np.ndarray:
+    """Return the travel until the centre comes within `reach` (both radii added) of `centre`.
+
+    `origin`, unit `direction`, `centre`: [..., D], D = 2 or 3. `reach`: [...].
+    Roots of t^2 + 2 b t + c = 0 with b = (o - p).d, c = |o - p|^2 - reach^2.
+    """
+    offset = origin - centre
+    b = np.einsum("...i,...i->...", offset, direction)
+    square = np.einsum("...i,...i->...", offset, offset)
+    return _entry(b, square - np.square(reach), square < np.square(reach + skip_gap))
+
+
+def cast_capsules(
+    origin: np.ndarray,
+    direction: np.ndarray,
+    radius: np.ndarray | float,
+    low: np.ndarray,
+    high: np.ndarray,
+    reach: np.ndarray | float,
+    skip_gap: float = 0.0,
+) -> np.ndarray:
+    """Return the travel of a sphere of `radius` until it meets a capsule.
+
+    `low`, `high`: the ends [..., 3] of the capsule's axis; `reach`: its own radius [...].
+    """
+    axis = high - low
+    length = np.sqrt(np.einsum("...i,...i->...", axis, axis))
+    unit = axis / np.maximum(length, _TINY)[..., None]
+    total = reach + radius
+    offset = origin - low
+    along, slope = _dot(offset, unit), _dot(direction, unit)
+    side, lateral = offset - along[..., None] * unit, direction - slope[..., None] * unit
+    a = np.maximum(_dot(lateral, lateral), _TINY)
+    body = _entry(_dot(side, lateral) / a, (_dot(side, side) - np.square(total)) / a, False)
+    with np.errstate(invalid="ignore"):
+        place = along + body * slope
+    body = np.where((place >= 0) & (place <= length), body, np.inf)
+    caps = np.minimum(
+        cast_spheres(origin, direction, low, total), cast_spheres(origin, direction, high, total)
+    )
+    near = side + (along - np.clip(along, 0, length))[..., None] * unit
+    touching = _dot(near, near) < np.square(total + skip_gap)
+    return np.where(touching, np.inf, np.minimum(body, caps))
+
+
+def cast_rectangles(
+    origin: np.ndarray,
+    direction: np.ndarray,
+    radius: np.ndarray | float,
+    centre: np.ndarray,
+    half: np.ndarray,
+    yaw: np.ndarray | float = 0.0,
+    skip_gap: float = 0.0,
+) -> np.ndarray:
+    """Return the travel of a disc of `radius` until it meets a rectangle, all in the plane (x, z).
+
+    `origin`, unit `direction`, `centre`, `half` (half extents): [..., 2]; `yaw`: [...] rad, clockwise from
+    above. For a horizontal ray against an upright box use `flat_radius` as radius (0: never hit).
+    """
+    local, turned = _to_box(origin - centre, yaw), _to_box(direction, yaw)
+    beyond = np.maximum(np.abs(local) - half, 0.0)
+    touching = _dot(beyond, beyond) < np.square(radius + skip_gap)
+    entry, point = _enter_slabs(local, turned, half + np.expand_dims(np.asarray(radius), -1))
+    corner = np.where(point >= 0, half, -half)
+    on_face = (np.abs(point) <= half).any(axis=-1)
+    rounded = cast_spheres(local, turned, corner, radius)
+    travel = np.where(on_face, entry, np.where(np.isfinite(entry), rounded, np.inf))
+    return np.where(touching | (np.asarray(radius) <= 0), np.inf, travel)
+
+
+def cast_upright_boxes(
+    origin: np.ndarray,
+    direction: np.ndarray,
+    radius: np.ndarray | float,
+    centre: np.ndarray,
+    half: np.ndarray,
+    yaw: np.ndarray | float = 0.0,
+    skip_gap: float = 0.0,
+) -> np.ndarray:
+    """Return the travel of a sphere of `radius` until it meets a box turned by `yaw` about the vertical.
+
+    `origin`, unit `direction`, `centre`, `half` (half extents): [..., 3]; `yaw`: [...] rad, clockwise.
+    """
+    return cast_boxes(_to_box(origin - centre, yaw), _to_box(direction, yaw), radius, half, skip_gap)
+
+
+def cast_boxes(
+    local: np.ndarray,
+    direction: np.ndarray,
+    radius: np.ndarray | float,
+    half: np.ndarray,
+    skip_gap: float = 0.0,
+) -> np.ndarray:
+    """Return the travel of a sphere until it meets a box, in the box's own frame (any orientation).
+
+    `local`: origins relative to the box's centre, `direction`: unit, `half`: half extents; [..., 3].
+    The sphere's centre meets the box rounded by `radius`: its faces (the entry into the larger box, where
+    that lies on a face), else one of the capsules around the three edges next to the entry.
+    """
+    beyond = np.maximum(np.abs(local) - half, 0.0)
+    touching = _dot(beyond, beyond) < np.square(radius + skip_gap)
+    entry, point = _enter_slabs(local, direction, half + np.expand_dims(np.asarray(radius), -1))
+    on_face = (np.abs(point) <= half).sum(axis=-1) >= 2
+    travel = np.where(on_face, entry, np.inf)
+    edge = np.isfinite(entry) & ~on_face & ~touching
+    if edge.any():
+        shape = edge.shape
+        rays = [np.broadcast_to(array, (*shape, 3))[edge] for array in (local, direction, half, point)]
+        travel[edge] = _cast_edges(rays[0], rays[1], rays[2], rays[3], np.broadcast_to(radius, shape)[edge])
+    return np.where(touching, np.inf, travel)
+
+
+def flat_radius(radius: float, height: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the radius at which a horizontally cast sphere meets an upright body, 0 if it passes by.
+
+    `height` of the sphere's centre; the body reaches from `low` to `high`: sqrt(radius^2 - gap^2).
+    """
+    gap = np.maximum(np.maximum(low - height, height - high), 0.0)
+    return np.sqrt(np.maximum(radius**2 - gap**2, 0.0))
+
+
+def _cast_edges(
+    local: np.ndarray, direction: np.ndarray, half: np.ndarray, point: np.ndarray, radius: np.ndarray
+) -> np.ndarray:
+    corner = np.where(point >= 0, half, -half)
+    travel = np.full(len(local), np.inf)
+    for axis in range(3):
+        low, high = corner.copy(), corner.copy()
+        low[:, axis], high[:, axis] = -half[:, axis], half[:, axis]
+        travel = np.minimum(travel, cast_capsules(local, direction, radius, low, high, 0.0))
+    return travel
+
+
+def _enter_slabs(
+    local: np.ndarray, direction: np.ndarray, reach: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where rays enter boxes of half extents `reach` (inf: they miss) and the points of entry.
+
+    A ray that starts inside the larger box, outside its rounding, gets its start.
+    """
+    safe = np.where(np.abs(direction) < _TINY, _TINY, direction)
+    one, two = (-reach - local) / safe, (reach - local) / safe
+    enter, leave = np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
+    enter = np.maximum(enter, 0.0)
+    point = local + enter[..., None] * direction
+    return np.where(enter <= leave, enter, np.inf), point
+
+
+def _entry(b: np.ndarray, c: np.ndarray, touching: np.ndarray | bool) -> np.ndarray:
+    """Return the first root t >= 0 of t^2 + 2 b t + c = 0, inf if there is none or c is inside already."""
+    root = b * b - c
+    hits = (root >= 0) & (b < 0) & (c >= 0) & ~np.asarray(touching)
+    return np.where(hits, -b - np.sqrt(np.maximum(root, 0.0)), np.inf)
+
+
+def _to_box(vector: np.ndarray, yaw: np.ndarray | float) -> np.ndarray:
+    """Rotate (x, z) or (x, y, z) into the frame of a box turned by `yaw`: x along right, z along forward."""
+    s, c = np.sin(yaw), np.cos(yaw)
+    x, z = vector[..., 0], vector[..., -1]
+    middle = [np.broadcast_to(vector[..., 1], (x * c).shape)] if vector.shape[-1] == 3 else []
+    return np.stack([x * c - z * s, *middle, x * s + z * c], axis=-1)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("...i,...i->...", a, b)
