@@ -128,8 +128,8 @@ def cast_spheres(
     Roots of t^2 + 2 b t + c = 0 with b = (o - p).d, c = |o - p|^2 - reach^2.
     """
     offset = origin - centre
-    b = np.einsum("...i,...i->...", offset, direction)
-    square = np.einsum("...i,...i->...", offset, offset)
+    b = _dot(offset, direction)
+    square = _dot(offset, offset)
     return _entry(b, square - np.square(reach), square < np.square(reach + skip_gap))
 
 
@@ -147,7 +147,7 @@ def cast_capsules(
     `low`, `high`: the ends [..., 3] of the capsule's axis; `reach`: its own radius [...].
     """
     axis = high - low
-    length = np.sqrt(np.einsum("...i,...i->...", axis, axis))
+    length = np.sqrt(_dot(axis, axis))
     unit = axis / np.maximum(length, _TINY)[..., None]
     total = reach + radius
     offset = origin - low
@@ -181,13 +181,14 @@ def cast_rectangles(
     above. For a horizontal ray against an upright box use `flat_radius` as radius (0: never hit).
     """
     local, turned = _to_box(origin - centre, yaw), _to_box(direction, yaw)
-    beyond = np.maximum(np.abs(local) - half, 0.0)
-    touching = _dot(beyond, beyond) < np.square(radius + skip_gap)
-    entry, point = _enter_slabs(local, turned, half + np.expand_dims(np.asarray(radius), -1))
-    corner = np.where(point >= 0, half, -half)
-    on_face = (np.abs(point) <= half).any(axis=-1)
-    rounded = cast_spheres(local, turned, corner, radius)
-    travel = np.where(on_face, entry, np.where(np.isfinite(entry), rounded, np.inf))
+    travel, within = _enter_slabs(local, turned, half, radius)
+    touching = _beyond(local, half) < np.square(radius + skip_gap)
+    corner = np.isfinite(travel) & (within == 0)
+    if corner.any():
+        start, ahead, extent = _pick((local, turned, half), corner)
+        point = start + travel[corner][:, None] * ahead
+        reach = np.broadcast_to(radius, corner.shape)[corner]
+        travel[corner] = cast_spheres(start, ahead, np.copysign(extent, point), reach)
     return np.where(touching | (np.asarray(radius) <= 0), np.inf, travel)
 
 
@@ -220,16 +221,14 @@ def cast_boxes(
     The sphere's centre meets the box rounded by `radius`: its faces (the entry into the larger box, where
     that lies on a face), else one of the capsules around the three edges next to the entry.
     """
-    beyond = np.maximum(np.abs(local) - half, 0.0)
-    touching = _dot(beyond, beyond) < np.square(radius + skip_gap)
-    entry, point = _enter_slabs(local, direction, half + np.expand_dims(np.asarray(radius), -1))
-    on_face = (np.abs(point) <= half).sum(axis=-1) >= 2
-    travel = np.where(on_face, entry, np.inf)
-    edge = np.isfinite(entry) & ~on_face & ~touching
+    travel, within = _enter_slabs(local, direction, half, radius)
+    touching = _beyond(local, half) < np.square(radius + skip_gap)
+    edge = np.isfinite(travel) & (within < 2) & ~touching
     if edge.any():
-        shape = edge.shape
-        rays = [np.broadcast_to(array, (*shape, 3))[edge] for array in (local, direction, half, point)]
-        travel[edge] = _cast_edges(rays[0], rays[1], rays[2], rays[3], np.broadcast_to(radius, shape)[edge])
+        start, ahead, extent = _pick((local, direction, half), edge)
+        point = start + travel[edge][:, None] * ahead
+        reach = np.broadcast_to(radius, edge.shape)[edge]
+        travel[edge] = _cast_edges(start, ahead, np.copysign(extent, point), reach)
     return np.where(touching, np.inf, travel)
 
 
@@ -243,30 +242,36 @@ def flat_radius(radius: float, height: np.ndarray, low: np.ndarray, high: np.nda
 
 
 def _cast_edges(
-    local: np.ndarray, direction: np.ndarray, half: np.ndarray, point: np.ndarray, radius: np.ndarray
+    local: np.ndarray, direction: np.ndarray, corner: np.ndarray, radius: np.ndarray
 ) -> np.ndarray:
-    corner = np.where(point >= 0, half, -half)
+    """Return the travel until the rounding of the three edges that meet in `corner`; all [n, 3]."""
     travel = np.full(len(local), np.inf)
     for axis in range(3):
         low, high = corner.copy(), corner.copy()
-        low[:, axis], high[:, axis] = -half[:, axis], half[:, axis]
+        low[:, axis], high[:, axis] = -np.abs(corner[:, axis]), np.abs(corner[:, axis])
         travel = np.minimum(travel, cast_capsules(local, direction, radius, low, high, 0.0))
     return travel
 
 
 def _enter_slabs(
-    local: np.ndarray, direction: np.ndarray, reach: np.ndarray
+    local: np.ndarray, direction: np.ndarray, half: np.ndarray, radius: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where rays enter boxes of half extents `reach` (inf: they miss) and the points of entry.
+    """Return where rays enter boxes of half extents `half + radius` (inf: they miss), and where on them.
 
-    A ray that starts inside the larger box, outside its rounding, gets its start.
+    The second array counts the axes on which the point of entry lies within `half`. A ray that starts
+    inside the larger box, outside its rounding, enters at its start. Works axis by axis: arrays of a
+    short last axis are slow.
     """
-    safe = np.where(np.abs(direction) < _TINY, _TINY, direction)
-    one, two = (-reach - local) / safe, (reach - local) / safe
-    enter, leave = np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
-    enter = np.maximum(enter, 0.0)
-    point = local + enter[..., None] * direction
-    return np.where(enter <= leave, enter, np.inf), point
+    axes = [(local[..., i], direction[..., i], half[..., i]) for i in range(half.shape[-1])]
+    enter: np.ndarray | float = 0.0
+    leave: np.ndarray | float = np.inf
+    for o, d, h in axes:
+        inverse = 1.0 / np.where(np.abs(d) < _TINY, _TINY, d)
+        middle, width = -o * inverse, np.abs(inverse) * (h + radius)
+        enter = np.maximum(enter, middle - width)
+        leave = np.minimum(leave, middle + width)
+    within = sum((np.abs(o + enter * d) <= h).astype(np.int8) for o, d, h in axes)
+    return np.where(enter <= leave, enter, np.inf), np.asarray(within)
 
 
 def _entry(b: np.ndarray, c: np.ndarray, touching: np.ndarray | bool) -> np.ndarray:
@@ -278,6 +283,8 @@ def _entry(b: np.ndarray, c: np.ndarray, touching: np.ndarray | bool) -> np.ndar
 
 def _to_box(vector: np.ndarray, yaw: np.ndarray | float) -> np.ndarray:
     """Rotate (x, z) or (x, y, z) into the frame of a box turned by `yaw`: x along right, z along forward."""
+    if np.ndim(yaw) == 0 and yaw == 0:
+        return vector
     s, c = np.sin(yaw), np.cos(yaw)
     x, z = vector[..., 0], vector[..., -1]
     middle = [np.broadcast_to(vector[..., 1], (x * c).shape)] if vector.shape[-1] == 3 else []
@@ -285,4 +292,18 @@ def _to_box(vector: np.ndarray, yaw: np.ndarray | float) -> np.ndarray:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("...i,...i->...", a, b)
+    total = a[..., 0] * b[..., 0]
+    for i in range(1, a.shape[-1]):
+        total = total + a[..., i] * b[..., i]
+    return total
+
+
+def _beyond(local: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return the squared distances of points from boxes."""
+    gaps = [np.maximum(np.abs(local[..., i]) - half[..., i], 0.0) for i in range(half.shape[-1])]
+    return np.asarray(sum(gap * gap for gap in gaps))
+
+
+def _pick(arrays: tuple[np.ndarray, ...], where: np.ndarray) -> list[np.ndarray]:
+    """Return the rows of broadcast arrays [..., D] at a mask [...]."""
+    return [np.broadcast_to(array, (*where.shape, array.shape[-1]))[where] for array in arrays]
