@@ -12,12 +12,17 @@ from mappo_unity.config import CollectConfig
 from mappo_unity.models import JointPolicy
 
 
-def make_collector(env: EnvBase, policy: JointPolicy, cfg: CollectConfig) -> Collector:
-    """Build a collector of endless batches of ``cfg.rounds`` rounds."""
+def num_rounds(cfg: CollectConfig, agents: int) -> int:
+    """Return the rounds of a batch for an environment with so many agent slots."""
+    return cfg.rounds if cfg.batch_size is None else -(-cfg.batch_size // agents)
+
+
+def make_collector(env: EnvBase, policy: JointPolicy, rounds: int) -> Collector:
+    """Build a collector of endless batches of so many rounds."""
     return Collector(
         env,
         policy,
-        frames_per_batch=cfg.rounds,
+        frames_per_batch=rounds,
         total_frames=-1,
         exploration_type=ExplorationType.RANDOM,
         track_traj_ids=False,

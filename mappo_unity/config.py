@@ -250,6 +250,8 @@ class PPOConfig:
     """Passes over a batch."""
     minibatch_size: int = 1024
     """Agent decisions (agent slots of whole team rows) in a minibatch."""
+    num_minibatches: Optional[int] = None
+    """Minibatches of an epoch, instead of ppo.minibatch_size; null: as that says."""
     entropy_coef: float = 0.0
     """Weight of the entropy bonus at the start."""
     entropy_schedule: Schedule = Schedule.linear
@@ -294,6 +296,7 @@ class PPOConfig:
         _between("ppo.clip_epsilon_final", self.clip_epsilon_final, 0, 1)
         _at_least("ppo.epochs", self.epochs, 1)
         _at_least("ppo.minibatch_size", self.minibatch_size, 1)
+        _at_least("ppo.num_minibatches", self.num_minibatches, 1)
         _at_least("ppo.entropy_coef", self.entropy_coef, 0)
         _at_least("ppo.entropy_coef_final", self.entropy_coef_final, 0)
         _at_least("ppo.value_coef", self.value_coef, 0)
@@ -310,9 +313,13 @@ class CollectConfig:
 
     rounds: int = 64
     """Rounds (environment steps) in a batch; a batch holds rounds x agents decisions."""
+    batch_size: Optional[int] = None
+    """Agent decisions in a batch at least, instead of collect.rounds (ML-Agents' buffer_size); null: as
+    collect.rounds says."""
 
     def __post_init__(self) -> None:
         _at_least("collect.rounds", self.rounds, 1)
+        _at_least("collect.batch_size", self.batch_size, 1)
 
 
 @dataclass

@@ -111,7 +111,7 @@ class PolicyLearner:
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(max_rows),
             sampler=SamplerWithoutReplacement(),
-            batch_size=max(1, cfg.minibatch_size // team_size),
+            batch_size=minibatch_rows(cfg, max_rows, team_size),
         )
 
     def learn(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
@@ -295,6 +295,13 @@ class PolicyLearner:
         self._load_trainable(state)
         self.value_norm.load_state_dict(state["value_norm"])
         self.rollbacks = int(state["rollbacks"])
+
+
+def minibatch_rows(cfg: PPOConfig, rows: int, team_size: int) -> int:
+    """Return the team rows of a minibatch."""
+    if cfg.num_minibatches is not None:
+        return -(-rows // cfg.num_minibatches)
+    return max(1, cfg.minibatch_size // team_size)
 
 
 def valued(entries: TensorDictBase) -> Tensor:

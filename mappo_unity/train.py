@@ -23,8 +23,9 @@ from mappo_unity import checkpoint
 from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.backend import make_env_function
 from mappo_unity.behavior_options import check_behaviors, options_of
-from mappo_unity.collect import make_collector
-from mappo_unity.config import Config, ConfigError
+from mappo_unity.collect import make_collector, num_rounds
+from mappo_unity.config import Config, ConfigError, EnvironmentFailure
+from mappo_unity.drops import drop_episodes
 from mappo_unity.encoders import ObsLayout
 from mappo_unity.export import RunExports, sample_inputs
 from mappo_unity.fit import check_fits, describe_models, describe_policies
@@ -76,10 +77,10 @@ def prepare_torch(cfg: Config) -> None:
     seed_everything(cfg.seed)
 
 
-def make_unity_env(cfg: Config) -> UnityEnv:
-    """Open the environment of the options behind the adapter."""
+def make_unity_env(cfg: Config, folder: Path) -> UnityEnv:
+    """Open the environment of the options behind the adapter; players log below the run's folder."""
     return UnityEnv(
-        make_env_function(cfg.env),
+        make_env_function(cfg.env, folder / "players"),
         cfg.seed,
         action_limit=CONTINUOUS_LIMIT,
         max_team_size=cfg.env.max_team_size,
@@ -88,20 +89,27 @@ def make_unity_env(cfg: Config) -> UnityEnv:
     )
 
 
+def batch_rounds(cfg: Config, env: UnityEnv) -> int:
+    """Return the rounds of a batch."""
+    return num_rounds(cfg.collect, sum(len(behavior.acting) for behavior in env.behaviors.values()))
+
+
 def make_learners(cfg: Config, env: UnityEnv) -> dict[str, PolicyLearner]:
     """Build networks and learner of every policy name."""
     check_behaviors(cfg, env.sides)
-    learners = {}
+    learners, rounds = {}, batch_rounds(cfg, env)
     for name, sides in env.sides.items():
         model, ppo = options_of(cfg, name)
         behavior = env.behaviors[sides[0]]
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
-        rows, agents = cfg.collect.rounds * teams, teams * team_size
-        if ppo.minibatch_size > rows * team_size:
+        rows, agents = rounds * teams, teams * team_size
+        wanted = ppo.minibatch_size if ppo.num_minibatches is None else ppo.num_minibatches * team_size
+        if wanted > rows * team_size:
+            option = "ppo.minibatch_size" if ppo.num_minibatches is None else "ppo.num_minibatches"
             raise ConfigError(
-                f"ppo.minibatch_size={ppo.minibatch_size} is larger than the batch of {name!r}: "
-                f"collect.rounds={cfg.collect.rounds} x {agents} agents = {rows * team_size} decisions; "
-                "lower ppo.minibatch_size or raise collect.rounds or env.num_areas"
+                f"{option}={getattr(ppo, option[4:])} is larger than the batch of {name!r}: "
+                f"collect.rounds={rounds} x {agents} agents = {rows * team_size} decisions; "
+                f"lower {option} or raise collect.rounds or env.num_areas"
             )
         obs = ObsLayout.from_specs(behavior.spec.observation_specs)
         layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
@@ -118,12 +126,13 @@ class Trainer:
         prepare_torch(cfg)
         check_backends(cfg.log)
         self.cfg, self.folder = cfg, folder
-        self.env = make_unity_env(cfg)
+        self.env = make_unity_env(cfg, folder)
         self.learners = make_learners(cfg, self.env)
         self.policy = JointPolicy({name: learner.actor for name, learner in self.learners.items()})
         self.window = EpisodeWindow(cfg.log.return_window, list(self.env.behaviors))
         self.iteration = self.agent_steps = 0
         self.wall_s = 0.0
+        self.restarts_before = self.dropped_episodes = self.dropped_steps = 0
         self.saved_at = 0
         self.best_score = -math.inf
         self.matched_at = 0
@@ -157,6 +166,9 @@ class Trainer:
             self.save()
             if self.exports is not None:
                 self.exports.finish(self.last_checkpoint)
+        except EnvironmentFailure:
+            self.save()
+            raise
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
@@ -174,13 +186,14 @@ class Trainer:
 
     def make_collector(self) -> Collector:
         """Build the collector; it goes on where the environment stands."""
-        return make_collector(transformed(self.env), self.policy, self.cfg.collect)
+        return make_collector(transformed(self.env), self.policy, batch_rounds(self.cfg, self.env))
 
     def iterate(self, batches: Any) -> None:
         """Collect a batch, learn from it, log, and save when it is time."""
         start = time.perf_counter()
         batch = next(batches)
         collected = time.perf_counter()
+        troubles = self._drop_cut_off(batch)
         learned = self._learn(batch)
         steps = count_decisions(batch, list(self.learners))
         self.samples = {
@@ -204,10 +217,29 @@ class Trainer:
             {"episodes": self.window.total, "episodes_new": episodes}
             | self.window.summary()
             | times
+            | troubles
             | learned
         )
         if self.agent_steps - self.saved_at >= self.cfg.checkpoint_interval:
             self.save()
+
+    def _drop_cut_off(self, batch: TensorDictBase) -> dict[str, float]:
+        """Take episodes that failed players cut off out of the batch; count them, and the restarts."""
+        if self.env.restarts is None:
+            return {}
+        cuts = self.env.pop_cut_off()
+        self.dropped_steps += drop_episodes(batch, cuts, self.env)
+        self.dropped_episodes += sum(int(cut.slots.sum()) for cut in cuts)
+        return {
+            "restarts": float(self.restarts),
+            "dropped_episodes": float(self.dropped_episodes),
+            "dropped_steps": float(self.dropped_steps),
+        }
+
+    @property
+    def restarts(self) -> int:
+        """Return how often players were started again in this run."""
+        return self.restarts_before + (self.env.restarts or 0)
 
     def _learn(self, batch: TensorDictBase) -> dict[str, float]:
         progress = self.agent_steps / self.cfg.max_steps
@@ -249,7 +281,7 @@ class Trainer:
         player = ActorPolicy(self._layout(), actors, False, "the policy")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.cfg.seed + self.agent_steps)
-            make_env = make_env_function(self.cfg.env)
+            make_env = make_env_function(self.cfg.env, self.folder / "players" / "matches")
             seed = (self.cfg.seed + self.agent_steps) % 2**31
             scores = play_matches(make_env, player, RandomPolicy(seed), self.cfg.matches.count, seed)
         total = sum(scores.values(), Score())
@@ -315,9 +347,13 @@ class Trainer:
             "rng": get_rng_state(),
             "samples": self.samples,
             **{name: getattr(self, name) for name in self._COUNTERS},
+            "restarts_before": self.restarts,
         }
 
-    _COUNTERS = ("iteration", "agent_steps", "wall_s", "saved_at", "best_score", "matched_at", "win_rate")
+    _COUNTERS = (
+        *("iteration", "agent_steps", "wall_s", "saved_at", "best_score", "matched_at", "win_rate"),
+        *("restarts_before", "dropped_episodes", "dropped_steps"),
+    )
 
     def load(self, path: Path) -> None:
         """Continue from a checkpoint.

@@ -49,6 +49,10 @@ def message_of(lines: list[str]) -> str:
 def test_every_file_under_conf_composes(file: str) -> None:
     group, _, name = file.removesuffix(".yaml").rpartition("/")
     lines = [f"{group}={name}"] if group else []
+    if group.startswith("official/"):  # chosen by the recipe and the env together
+        lines = [f"recipe={group.removeprefix('official/')}", f"env={name}"]
+    if name == "unity":
+        lines.append("env.file_name=Game")
     if name == "custom":
         lines.append(FACTORY)
     config = compose_config(lines).config
