@@ -12,22 +12,28 @@ import torch
 
 from mappo_unity import checkpoint
 from mappo_unity.backend import make_env_function
-from mappo_unity.compose import load_config
+from mappo_unity.compose import config_to_play
 from mappo_unity.episodes import play, summarize
 from mappo_unity.matches import Score, play_matches
+from mappo_unity.onnx_policy import SUFFIX, OnnxPolicy
 from mappo_unity.policies import CheckpointPolicy, Policy, RandomPolicy
-from mappo_unity.runs import CONFIG, find_run
 
 
 def evaluate(
-    run: Path, episodes: int, deterministic: bool = False, seed: int = 0, opponent: str | None = None
+    run: Path,
+    episodes: int,
+    deterministic: bool = False,
+    seed: int = 0,
+    opponent: str | None = None,
+    env: str | None = None,
 ) -> dict[str, Any]:
-    """Play a run's policy in its own environment.
+    """Play a run's policy in its own environment, or in another.
 
     Args:
-        run: run folder (its best checkpoint plays, else its newest) or a checkpoint file.
+        run: run folder (its best checkpoint plays, else its newest), a checkpoint or an ONNX file.
         episodes: agent episodes of every behavior; with an opponent, matches.
-        opponent: "random", or another run or checkpoint, for environments with two sides.
+        opponent: "random", or another run, checkpoint or ONNX file, for environments with two sides.
+        env: preset of the environment; None = that of the run.
 
     Returns:
         Figures for the table and the JSON line of mappo-eval.
@@ -38,18 +44,18 @@ def evaluate(
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     policy = open_policy(str(run), deterministic, seed)
-    make_env = make_env_function(load_config(find_run(run, "run") / CONFIG).env)
+    make_env = make_env_function(config_to_play(run, env).env)
     head = {"policy": str(getattr(policy, "path", run)), "deterministic": deterministic, "seed": seed}
-    head |= {"agent_steps": policy.agent_steps} if isinstance(policy, CheckpointPolicy) else {}
+    head |= {"agent_steps": policy.agent_steps} if isinstance(policy, (CheckpointPolicy, OnnxPolicy)) else {}
     if opponent is not None:
         other = open_policy(opponent, deterministic, seed)
         scores = play_matches(make_env, policy, other, episodes, seed)
         return head | {"opponent": opponent} | match_figures(scores)
-    env = make_env(seed)
+    base_env = make_env(seed)
     try:
-        finished = play(env, policy, episodes)
+        finished = play(base_env, policy, episodes)
     finally:
-        env.close()
+        base_env.close()
     behaviors = {name: summarize(rows) for name, rows in finished.items()}
     return head | (next(iter(behaviors.values())) if len(behaviors) == 1 else {"behaviors": behaviors})
 
@@ -63,9 +69,11 @@ def match_figures(scores: dict[str, Score]) -> dict[str, Any]:
 
 
 def open_policy(where: str, deterministic: bool, seed: int) -> Policy:
-    """Return "random", or the policy of a run folder or checkpoint."""
+    """Return "random", or the policy of a run folder, checkpoint or ONNX file."""
     if where == "random":
         return RandomPolicy(seed)
+    if where.endswith(SUFFIX):
+        return OnnxPolicy(Path(where), deterministic, seed)
     return CheckpointPolicy(choose_checkpoint(Path(where)), deterministic)
 
 
