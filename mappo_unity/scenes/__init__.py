@@ -17,6 +17,7 @@ SCENES = {
     "3DBall": "ball3d:Ball3D",
     "Basic": "basic:Basic",
     "Walker": "walker:Walker",
+    "Hallway": "hallway:Hallway",
 }
 """Module and class of every scene, below this package."""
 

@@ -127,8 +127,14 @@ def stop(
     `velocity`, `normal` ``[n, 3]``; `gap` ``[n]``, m, may still be closed within the tick. Inelastic;
     friction takes at most `friction` * impulse of the speed along the surface.
     """
-    zero = np.zeros(3)
-    return stop_pair(velocity, np.zeros_like(velocity), normal, gap, np.ones(3), zero, friction)
+    speed = np.einsum("ni,ni->n", velocity, normal)
+    impulse = np.maximum(-speed - np.maximum(gap, 0.0) / TICK_S, 0.0)
+    rub = velocity - normal * speed[:, None]
+    slip = np.sqrt(np.einsum("ni,ni->n", rub, rub))
+    rub *= (np.minimum(friction * impulse / np.maximum(slip, 1e-12), 1.0))[:, None]
+    velocity += normal * impulse[:, None]
+    velocity -= rub
+    return impulse
 
 
 def stop_pair(
