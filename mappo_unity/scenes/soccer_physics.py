@@ -1,0 +1,210 @@
+"""The bodies of soccer fields as discs on a plane: one tick of all fields at once.
+
+In: velocity changes of the agents, and who kicks. Out: positions, contacts begun, goals. Knows no rules.
+Facts and reasons: docs/scenes/SoccerTwos.md. A tick, as in Unity's engine: forces and drag; contacts that
+exist at the start (gap < 0.02 m) are solved; bodies move, stopped by the pitch (continuous detection; pairs
+of bodies are not swept); then the callbacks: kicks, goals.
+Legend: F fields, A agents of a field, B = 1 + A bodies (the ball first), n contacts. Body b of field f has
+the number b * F + f; the number B * F stands for the pitch.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from mappo_unity.scenes.soccer_contacts import Bodies, Contacts
+from mappo_unity.scenes.soccer_pitch import BALL_HEIGHT, GOAL_FLOOR_X, MARGIN, Pitch
+
+TICK_S = 0.02
+AGENT_RADIUS, AGENT_MASS = 0.5, 50.0  # m, kg
+BALL_RADIUS, BALL_MASS = 41.61146 * 0.015, 3.0
+AGENT_KEPT = 1 - 3.0 * TICK_S  # drag 3/s
+BALL_KEPT = 1 - 1.0 * TICK_S  # drag and angular drag 1/s
+MAX_SPIN = 7.0  # rad/s: the engine's limit for bodies that set none
+KICK_SPEED = 2000 * TICK_S / BALL_MASS  # m/s: a force of 2000 N for one tick
+PUSH_OUT, MAX_PUSH_OUT = 0.8, 10.0 * TICK_S  # share of a penetration removed in a tick; at most 10 m/s
+GOAL_LINE_X = GOAL_FLOOR_X - (BALL_RADIUS**2 - BALL_HEIGHT**2) ** 0.5  # of a ball that meets the goal's floor
+SLIP_SHARE = 2 / 7  # of the ball's way at most lost to its rub on the floor: solid sphere, slip to roll
+SLIP_WAY = 0.35 * PUSH_OUT * (BALL_RADIUS - BALL_HEIGHT)  # m in a tick: friction times push-out
+
+
+class SoccerPhysics:
+    """Move the bodies of F fields.
+
+    `position`, `velocity` float64 [2, B, F]: x and z; `spin` float64 [F]: the balls', about y, rad/s,
+    clockwise seen from above; `kick` float64 [2, F]: the balls' velocity change that waits for the next
+    tick; `touching` bool [A, F]: agents in contact with their ball.
+    """
+
+    def __init__(self, num_fields: int, num_agents: int, blue_closed: bool = False) -> None:
+        bodies = (1 + num_agents, num_fields)
+        self.pitch = Pitch(blue_closed)
+        self.num_fields, self.num_agents = num_fields, num_agents
+        self._bodies = Bodies(num_fields, num_agents * num_fields, (BALL_MASS, BALL_RADIUS), AGENT_MASS)
+        self._last = bodies[0] * num_fields  # the pitch's number
+        self.position = np.zeros((2, *bodies))
+        self.velocity = self._bodies.velocity[:, : self._last].reshape(2, *bodies)
+        self.spin = self._bodies.spin[:num_fields]
+        self.kick = np.zeros((2, num_fields))
+        self.touching = np.zeros((num_agents, num_fields), bool)
+        radius = np.where(np.arange(bodies[0]) == 0, BALL_RADIUS, AGENT_RADIUS)
+        self._radius = np.repeat(radius, num_fields)
+        self._limits = self.pitch.limits(radius[:, None])
+        self._first, self._second = np.array(list(combinations(range(bodies[0]), 2))).T
+        reach = radius[self._first] + radius[self._second] + MARGIN
+        self._reach_squared = (reach**2)[:, None]
+
+    def place(self, body: int, fields: np.ndarray, x: np.ndarray | float, z: np.ndarray | float) -> None:
+        """Put a body of `fields` [n] at rest at x, z [n]; a kick that waits for its tick still comes."""
+        self.position[0, body, fields] = x
+        self.position[1, body, fields] = z
+        self.velocity[:, body, fields] = 0
+        if body == 0:
+            self.spin[fields] = 0
+
+    def step(self, drive: np.ndarray, kick_power: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Advance one tick.
+
+        `drive` float64 [2, A, F]: velocity changes of the agents, m/s; `kick_power` float64 [A, F], 0 to 1.
+        Returns who began contact with the ball, bool [A, F], and how many parts of the blue and of the
+        purple goal each ball began contact with, int64 [F] each.
+        """
+        self._accelerate(drive)
+        contacts, begun = self._contacts()
+        points = self._kick_points(begun) if begun.any() else None
+        bounces = self._bodies.solve(contacts, TICK_S) if len(contacts.i) else None
+        start = self.position
+        self.position = start + self._moves(contacts, bounces)
+        self._stop_at_pitch(start)
+        if points is not None:
+            self._kick(begun, points, kick_power)
+        return begun, *self._goals(start)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return copies of everything that the next tick depends on."""
+        return {name: getattr(self, name).copy() for name in _STATE}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_state` returned."""
+        for name in _STATE:
+            getattr(self, name)[...] = state[name]
+
+    def _accelerate(self, drive: np.ndarray) -> None:
+        velocity, kick = self.velocity, self.kick
+        velocity[:, 1:] += drive
+        velocity[:, 1:] *= AGENT_KEPT
+        velocity[:, 0] += kick
+        velocity[:, 0] *= BALL_KEPT
+        kick[...] = 0
+        spin = self.spin
+        spin *= BALL_KEPT
+        np.minimum(spin, MAX_SPIN, out=spin)
+        np.maximum(spin, -MAX_SPIN, out=spin)
+
+    def _contacts(self) -> tuple[Contacts, np.ndarray]:
+        """Return all contacts of this tick, and who begins one with the ball, bool [A, F]."""
+        position = self.position
+        away = position[:, self._first] - position[:, self._second]  # [2, pairs, F]
+        squared = away[0] * away[0] + away[1] * away[1]
+        close = squared < self._reach_squared
+        touching = close[: self.num_agents]
+        begun = touching & ~self.touching
+        self.touching = touching
+        near = self.pitch.near(position[0], position[1], self._limits)
+        parts = []
+        if close.any():
+            pair, field = np.nonzero(close)
+            distance = np.sqrt(squared[pair, field]) + 1e-12
+            i, j = self._first[pair] * self.num_fields + field, self._second[pair] * self.num_fields + field
+            gap = distance - self._radius[i] - self._radius[j]
+            x, z = away[:, pair, field] / distance
+            parts.append(Contacts(i, j, x, z, gap))
+        if near.any():
+            body = np.flatnonzero(near)
+            x, z = self._flat(position)[:, body]
+            row, x, z, gap = self.pitch.contacts(x, z, self._radius[body])
+            parts.append(Contacts(body[row], np.full(len(row), self._last), x, z, gap))
+        if len(parts) == 1:
+            return parts[0], begun
+        return (Contacts(*map(np.concatenate, zip(*parts, strict=True))) if parts else _NO_CONTACTS), begun
+
+    def _moves(self, contacts: Contacts, bounces: np.ndarray | None) -> np.ndarray:
+        """Return the ways of a tick [2, B, F]: velocity, less the balls' slip, plus push-out.
+
+        The floor takes way but no speed from the ball, and a push-out gives way but no speed: both act in
+        the engine's position iterations only.
+        """
+        moves = self._bodies.velocity * TICK_S
+        way = np.sqrt((moves[:, : self.num_fields] ** 2).sum(axis=0)) + 1e-12
+        moves[:, : self.num_fields] *= 1 - np.minimum(SLIP_SHARE, SLIP_WAY / way)
+        if bounces is not None:
+            i, j, normal_x, normal_z, gap = contacts
+            closing = (moves[0, j] - moves[0, i]) * normal_x + (moves[1, j] - moves[1, i]) * normal_z
+            deep = np.minimum(gap, 0)
+            push = np.minimum(-PUSH_OUT * deep, MAX_PUSH_OUT) + closing + deep - gap
+            push = np.where(bounces, 0, np.maximum(push, 0))
+            if push.any():
+                weight_i, weight_j = self._bodies.inverse_mass[i], self._bodies.inverse_mass[j]
+                push /= weight_i + weight_j
+                for axis, normal in enumerate((normal_x, normal_z)):
+                    np.add.at(moves[axis], i, push * normal * weight_i)
+                    np.subtract.at(moves[axis], j, push * normal * weight_j)
+        return moves[:, : self._last].reshape(self.position.shape)
+
+    def _stop_at_pitch(self, start: np.ndarray) -> None:
+        """Stop bodies where the pitch is in their way, and bounce them there.
+
+        A body that was in contact at the start slides on instead of losing the rest of its way.
+        """
+        near = self.pitch.near(self.position[0], self.position[1], self._limits)
+        if not near.any():
+            return
+        body = np.flatnonzero(near)
+        (x, z), (to_x, to_z) = self._flat(start)[:, body], self._flat(self.position)[:, body]
+        share, (row, normal_x, normal_z, gap) = self.pitch.way(x, z, to_x, to_z, self._radius[body])
+        if not row.size:
+            return
+        body, share, x, z, to_x, to_z = (each[row] for each in (body, share, x, z, to_x, to_z))
+        slides = gap - normal_x * (to_x - x) - normal_z * (to_z - z) < MARGIN
+        position = self._flat(self.position)
+        position[0, body] = np.where(slides, to_x - gap * normal_x, x + share * (to_x - x))
+        position[1, body] = np.where(slides, to_z - gap * normal_z, z + share * (to_z - z))
+        pitch = np.full(len(body), self._last)
+        self._bodies.solve(Contacts(body, pitch, normal_x, normal_z, np.zeros(len(body))), TICK_S)
+
+    def _kick_points(self, begun: np.ndarray) -> np.ndarray:
+        """Return the points of contact [2, k] of agents that began one: midway between the surfaces."""
+        agent, field = np.nonzero(begun)
+        at = self.position[:, 1 + agent, field]
+        away = self.position[:, 0, field] - at
+        distance = np.sqrt((away * away).sum(axis=0)) + 1e-12
+        return at + away / distance * (0.5 * (distance + AGENT_RADIUS - BALL_RADIUS))
+
+    def _kick(self, begun: np.ndarray, points: np.ndarray, power: np.ndarray) -> None:
+        """Kick the balls from where the agents are now towards where contact was at the tick's start."""
+        agent, field = np.nonzero(begun)
+        away = points - self.position[:, 1 + agent, field]
+        away *= KICK_SPEED * power[agent, field] / (np.sqrt((away * away).sum(axis=0)) + 1e-12)
+        for axis in range(2):
+            np.add.at(self.kick[axis], field, away[axis])
+
+    def _goals(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Count goal parts that balls touch; a ball is stopped at the line, where the engine stops it."""
+        ball = self.position[:, 0]
+        over = np.flatnonzero(np.abs(ball[0]) > GOAL_LINE_X)
+        if over.size:
+            begin = start[:, 0, over]
+            to_line = np.copysign(GOAL_LINE_X, ball[0, over]) - begin[0]
+            step = ball[:, over] - begin
+            ball[:, over] = begin + step * np.clip(to_line / step[0], 0, 1)
+        return self.pitch.goals(ball[0], ball[1], BALL_RADIUS)
+
+    def _flat(self, position: np.ndarray) -> np.ndarray:
+        return position.reshape(2, -1)
+
+
+_STATE = ("position", "velocity", "spin", "kick", "touching")
+_NO_CONTACTS = Contacts(*np.zeros((2, 0), np.int64), *np.zeros((3, 0)))
