@@ -17,6 +17,8 @@ SCENES = {
     "3DBall": "ball3d:Ball3D",
     "Basic": "basic:Basic",
     "Walker": "walker:Walker",
+    "SoccerTwos": "soccer:SoccerTwos",
+    "StrikersVsGoalie": "soccer:StrikersVsGoalie",
     "Hallway": "hallway:Hallway",
 }
 """Module and class of every scene, below this package."""
