@@ -17,8 +17,10 @@ SCENES = {
     "3DBall": "ball3d:Ball3D",
     "Basic": "basic:Basic",
     "Walker": "walker:Walker",
+    "GridFoodCollector": "grid_food_collector:GridFoodCollector",
     "SoccerTwos": "soccer:SoccerTwos",
     "StrikersVsGoalie": "soccer:StrikersVsGoalie",
+    "DungeonEscape": "dungeon_escape:DungeonEscape",
     "Hallway": "hallway:Hallway",
 }
 """Module and class of every scene, below this package."""
