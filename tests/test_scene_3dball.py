@@ -35,7 +35,7 @@ class Still(Ball3D):
 
 def level(env: Ball3D, height: float = 3.0) -> None:
     """Level every cube and put every ball at rest above its middle."""
-    env.cube_rotation[:] = (1, 0, 0, 0)
+    env.set_cubes(np.arange(env.num_areas), np.tile([[1.0], [0], [0], [0]], env.num_areas))
     env.ball_position[:] = (0, height, 0)
     env.ball_velocity[:] = 0
     env.ball_spin[:] = 0
@@ -210,7 +210,7 @@ def test_ball_rolls_down_a_tilted_cube(mass: float) -> None:
     env.reset()
     level(env)
     theta = np.radians(6)
-    env.cube_rotation[:] = turned(env.cube_rotation.T, "z", np.full(1, theta)).T
+    env.set_cubes(np.arange(1), turned(env.cube_rotation.T, "z", np.full(1, theta)))
     env.ball_position[:] = 3.0 * np.array([-np.sin(theta), np.cos(theta), 0])
     for _ in range(5):
         env.step()

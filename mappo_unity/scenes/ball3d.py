@@ -78,7 +78,7 @@ class Ball3D(Scene):
         self.ball_position = self.physics.qpos[:, 0:3]  # relative to the cube, which stands at the origin
         self.ball_velocity = self.physics.qvel[:, 0:3]
         self.ball_spin = self.physics.qvel[:, 3:6]
-        self.cube_rotation = self.physics.mocap_quat[:, 0]  # w, x, y, z
+        self.cube_rotation = self.physics.mocap_quat[:, 0]  # w, x, y, z; written by set_cubes
         self._matrix = matrices(self.cube_rotation.T)  # [3, 3, N], after this tick's turn
         self._before = np.zeros((3, self.num_areas))  # the ball in the cube's frame before the turn
         self._turned = np.zeros(self.num_areas, bool)  # whether `_before` belongs to this episode
@@ -90,7 +90,7 @@ class Ball3D(Scene):
         tilt = np.radians(self.rng.uniform(-10, 10, (len(slots), 2)))
         flat = np.zeros((4, len(slots)))
         flat[0] = 1
-        self.cube_rotation[slots] = turned(turned(flat, "x", tilt[:, 0]), "z", tilt[:, 1]).T
+        self.set_cubes(slots, turned(turned(flat, "x", tilt[:, 0]), "z", tilt[:, 1]))
         self.ball_position[slots, 1] = 4
         self.ball_position[slots[:, None], [0, 2]] = self.rng.uniform(-1.5, 1.5, (len(slots), 2))
         self.ball_velocity[slots] = 0  # the spin is kept
@@ -109,11 +109,13 @@ class Ball3D(Scene):
 
     def act(self, slots: np.ndarray) -> None:
         """Turn the cubes; 0.1 replaces the reward of the window, or -1 and the end if the ball has fallen."""
-        angle = np.clip(self.agents.continuous.T, -1.0, 1.0) * TURN_RAD
-        self._before = in_cube(matrices(self.cube_rotation.T), self.ball_position.T)
+        angle = np.minimum(np.maximum(self.agents.continuous.T, -1.0), 1.0) * TURN_RAD
+        self._before = in_cube(self._matrix, self.ball_position.T)
         self._turned[:] = True
         rotation = limited_turn(self.cube_rotation.T, "z", angle[0])
-        self.cube_rotation[...] = limited_turn(rotation, "x", angle[1]).T
+        rotation = limited_turn(rotation, "x", angle[1])
+        self.cube_rotation[...] = rotation.T
+        self._matrix = matrices(rotation)
         x, y, z = self.ball_position.T
         fallen = (y < -2) | (np.abs(x) > 3) | (np.abs(z) > 3)
         self.agents.reward[:] = 0.1
@@ -123,7 +125,6 @@ class Ball3D(Scene):
 
     def simulate(self) -> None:
         """Advance one tick; before it move, damp and limit the balls as the engine does."""
-        self._matrix = matrices(self.cube_rotation.T)
         spin = self.ball_spin
         spin *= SPIN_KEPT
         fast = np.einsum("ni,ni->n", spin, spin) > MAX_SPIN**2
@@ -137,6 +138,11 @@ class Ball3D(Scene):
         if name == "gravity":
             self.physics.set_gravity(self.parameters["gravity"])
 
+    def set_cubes(self, slots: np.ndarray, rotation: np.ndarray) -> None:
+        """Put cubes into rotations [4, n] (w, x, y, z); the only way besides `act` to turn them."""
+        self.cube_rotation[slots] = rotation.T
+        self._matrix[:, :, slots] = matrices(rotation)
+
     def scene_state(self) -> dict[str, Any]:
         """Return the physics and the parameters in force in every area."""
         return {"physics": self.physics.get_state(), "mass": self.mass.copy(), "scale": self.scale.copy()}
@@ -145,6 +151,7 @@ class Ball3D(Scene):
         """Restore `scene_state`, the balls' masses and sizes included."""
         self.physics.set_gravity(self.parameters["gravity"])
         self.physics.set_state(state["physics"])
+        self._matrix = matrices(self.cube_rotation.T)
         changed = np.flatnonzero((self.mass != state["mass"]) | (self.scale != state["scale"]))
         self.mass[:], self.scale[:] = state["mass"], state["scale"]
         self._set_balls(changed)
@@ -158,18 +165,17 @@ class Ball3D(Scene):
         surface's speed of up to 3.5 m/s.
         """
         local = in_cube(self._matrix, self.ball_position.T)
-        offset = local - np.clip(local, -CUBE_HALF, CUBE_HALF)  # from the cube's nearest point
-        distance = np.sqrt((offset * offset).sum(axis=0))
+        offset = local - np.minimum(np.maximum(local, -CUBE_HALF), CUBE_HALF)  # from its nearest point
+        distance = np.sqrt(np.einsum("in,in->n", offset, offset))
         depth = BALL_RADIUS * self.scale - distance
-        near = np.flatnonzero((depth > -TOUCH_GAP) & (distance > 0))
-        if not near.size:
+        touching = depth > -TOUCH_GAP
+        if not touching.any():
             return
-        normal = offset[:, near] / distance[near]
-        push = np.clip(PUSH_OUT * (depth[near] - CONTACT_SLACK), 0, MAX_PUSH_OUT)
-        slip = np.where(self._turned[near], self._before[:, near] - local[:, near], 0)
-        slip -= normal * (slip * normal).sum(axis=0)
-        shift = push * normal + ROLLING_SHARE * slip
-        self.ball_position[near] += np.einsum("ijn,jn->ni", self._matrix[:, :, near], shift)
+        normal = offset / np.maximum(distance, CONTACT_SLACK)  # zero inside the cube: no direction out
+        push = np.minimum(np.maximum(PUSH_OUT * (depth - CONTACT_SLACK), 0), MAX_PUSH_OUT)
+        slip = (self._before - local) * (ROLLING_SHARE * (touching & self._turned & (distance > 0)))
+        shift = slip + normal * (push - np.einsum("in,in->n", slip, normal))
+        self.ball_position += np.einsum("ijn,jn->ni", self._matrix, shift)
 
     def _read_parameters(self, slots: np.ndarray) -> None:
         mass, scale = self.parameters["mass"], self.parameters["scale"]
@@ -199,17 +205,26 @@ def turned(rotation: np.ndarray, axis: str, angle: np.ndarray) -> np.ndarray:
     w, x, y, z = rotation
     half = 0.5 * angle
     s, c = np.sin(half), np.cos(half)
+    out = np.empty(rotation.shape)
     if axis == "x":
-        return np.stack([w * c - x * s, x * c + w * s, y * c + z * s, z * c - y * s])
-    assert axis == "z"
-    return np.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s])
+        out[0], out[1], out[2], out[3] = w * c - x * s, x * c + w * s, y * c + z * s, z * c - y * s
+    else:
+        assert axis == "z"
+        out[0], out[1], out[2], out[3] = w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s
+    return out
 
 
 def matrices(rotation: np.ndarray) -> np.ndarray:
     """Return rotation matrices [3, 3, N] of unit quaternions [4, N] (w, x, y, z)."""
-    (_, _, _, _), (wx, xx, _, _), (wy, xy, yy, _), (wz, xz, yz, zz) = 2 * rotation[:, None] * rotation
-    rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
-    return np.array(rows).reshape(3, 3, -1)
+    w, x, y, z = rotation
+    xx, yy, zz = 2 * rotation[1:] * rotation[1:]
+    wx, wy, wz = 2 * w * rotation[1:]
+    xy, xz, yz = 2 * x * y, 2 * x * z, 2 * y * z
+    out = np.empty((3, 3, rotation.shape[1]))
+    out[0, 0], out[0, 1], out[0, 2] = 1 - yy - zz, xy - wz, xz + wy
+    out[1, 0], out[1, 1], out[1, 2] = xy + wz, 1 - xx - zz, yz - wx
+    out[2, 0], out[2, 1], out[2, 2] = xz - wy, yz + wx, 1 - xx - yy
+    return out
 
 
 def in_cube(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -221,4 +236,4 @@ def limited_turn(rotation: np.ndarray, axis: str, angle: np.ndarray) -> np.ndarr
     """Turn as `turned`, but not further where the axis' component has passed +-0.25 already."""
     tilt = rotation[1 if axis == "x" else 3]
     allowed = ((tilt < TILT_LIMIT) & (angle > 0)) | ((tilt > -TILT_LIMIT) & (angle < 0))
-    return turned(rotation, axis, np.where(allowed, angle, 0.0))
+    return turned(rotation, axis, angle * allowed)
