@@ -2,7 +2,8 @@
 
 In: poses and velocities of all areas. Out: the same, one tick later, and which agent touched which ball.
 Knows no rewards. Plain numpy, all areas at once; why no rigid-body engine: fifty free balls an area cost
-MuJoCo three to five times as much, and the doubled friction of boxes needs explicit rules anyway (`ground.py`).
+MuJoCo three to five times as much, and the doubled friction of boxes needs explicit rules anyway
+(`ground.py`).
 
 A tick follows Unity's engine: free motion; contacts of the poses at the start (gaps below 0.02 m count);
 inelastic impulses in `ITERATIONS` rounds, friction after them; motion; penetrations shrink without leaving a
