@@ -270,6 +270,20 @@ def cast_boxes(
     return np.where(touching, np.inf, travel)
 
 
+def passes(
+    origin: np.ndarray, direction: np.ndarray, centre: np.ndarray, reach: np.ndarray | float
+) -> np.ndarray:
+    """Return which rays come within `reach` of `centre` ahead: a cheap test before exact casts.
+
+    `origin`, unit `direction`, `centre`: [..., D]; `reach` [...]: radius of a sphere around a collider, the
+    cast sphere's radius added; negative: never.
+    """
+    offset = centre - origin
+    along = _dot(offset, direction)
+    beside = _dot(offset, offset) - along * along
+    return (beside < np.square(reach)) & (along > -np.asarray(reach)) & (np.asarray(reach) >= 0)
+
+
 def flat_radius(radius: float, height: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the radius at which a horizontally cast sphere meets an upright body, 0 if it passes by.
 
