@@ -98,7 +98,8 @@ class DungeonEscape(Scene):
         """Count the areas' time and interrupt groups at its limit."""
         self.timer += 1
         late = self.timer >= TIME_LIMIT
-        self._end_groups(np.flatnonzero(late), interrupted=True)
+        if late.any():
+            self._end_groups(np.flatnonzero(late), interrupted=True)
 
     def simulate(self) -> None:
         """Move all bodies by one tick, then let touches act: key, dragon, lock, portal."""

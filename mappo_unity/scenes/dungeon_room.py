@@ -53,6 +53,7 @@ HALVES = np.array(
 )
 REACH = np.hypot(HALVES[:, 0], HALVES[:, 2]) + np.hypot(0.5, 0.5) + CONTACT_GAP
 TOUCH_GAP = np.where(np.arange(7) == KEY, 0.0, CONTACT_GAP)  # a trigger must overlap
+DRAGON_REACH = 0.85 + np.hypot(0.75, 0.75) + CONTACT_GAP  # of a column's base, along x and z
 FRICTION = {COLUMN_BASE: 0.0, LOCK: BOX_FRICTION, TOMB: BOX_FRICTION}
 
 _ARRAYS = (
@@ -63,6 +64,7 @@ _ARRAYS = (
     "dragon_fall",
     "dragon_yaw",
     "dragon_speed",
+    "_dragon_step",
     "dragon_present",
     "key_present",
     "tomb_present",
@@ -92,6 +94,7 @@ class DungeonRoom:
         self.dragon_fall = np.zeros(num_areas)
         self.dragon_yaw = np.zeros(num_areas)
         self.dragon_speed = np.zeros(num_areas)
+        self._dragon_step = np.zeros((num_areas, 2))  # m in a tick, x and z
         self.dragon_present = np.zeros(num_areas, bool)
         self.key_present = np.zeros(num_areas, bool)
         self.tomb_present = np.zeros(num_areas, bool)
@@ -156,7 +159,7 @@ class DungeonRoom:
         self.dragon_position[areas, ::2] = DRAGON_START[turn]
         self.dragon_fall[areas] = 0.0
         self.dragon_speed[areas] = rng.uniform(*speed, len(areas))
-        self._face_portal()
+        self._face_portal(areas)
 
     # ---- one tick ---------------------------------------------------------------------------------------
 
@@ -190,7 +193,8 @@ class DungeonRoom:
 
     def dragon_escapes(self) -> np.ndarray:
         """Return bool [N]: which dragons touch the portal."""
-        near = self.dragon_present & (((self.dragon_position[:, ::2] - PORTAL_TARGET) ** 2).sum(1) < 16.0)
+        near = self.dragon_position[:, 0] > PORTAL_TARGET[0] - 4.0
+        near &= self.dragon_present
         if near.any():
             areas = np.flatnonzero(near)
             offset = self.dragon_position[areas] - self._target[areas, 0, PORTAL]
@@ -210,29 +214,32 @@ class DungeonRoom:
 
     # ---- parts of a tick --------------------------------------------------------------------------------
 
-    def _face_portal(self) -> None:
-        ahead = PORTAL_TARGET - self.dragon_position[:, ::2]
-        self.dragon_yaw[:] = np.arctan2(ahead[:, 0], ahead[:, 1])
+    def _face_portal(self, areas: np.ndarray) -> None:
+        """Turn dragons to the portal; on a straight way they keep that heading."""
+        ahead = PORTAL_TARGET - self.dragon_position[areas, ::2]
+        self.dragon_yaw[areas] = np.arctan2(ahead[:, 0], ahead[:, 1])
+        step = self.dragon_speed[areas] * TICK_S / np.hypot(ahead[:, 0], ahead[:, 1])
+        self._dragon_step[areas] = step[:, None] * ahead
 
     def _move_dragons(self) -> None:
         """Step towards the portal by position; slide along a column's base; fall onto the floor."""
         position = self.dragon_position
-        self._face_portal()
-        step = self.dragon_speed * TICK_S
-        position[:, 0] += step * np.sin(self.dragon_yaw)
-        position[:, 2] += step * np.cos(self.dragon_yaw)
-        self.dragon_fall -= self.gravity * TICK_S
-        self.dragon_fall *= DRAGON_DRAG_KEPT
+        position[:, ::2] += self._dragon_step
         height = position[:, 1] - DRAGON_HALF[1]
-        self.dragon_fall[:] = np.maximum(self.dragon_fall, -height / TICK_S)  # lands exactly
-        position[:, 1] += self.dragon_fall * TICK_S
-        offset = np.abs(position[:, ::2]) - COLUMN
-        near = np.flatnonzero((np.abs(offset) < 1.95).all(axis=1))
+        if height.any():
+            self.dragon_fall -= self.gravity * TICK_S
+            self.dragon_fall *= DRAGON_DRAG_KEPT
+            self.dragon_fall[:] = np.maximum(self.dragon_fall, -height / TICK_S)
+            landed = height + self.dragon_fall * TICK_S <= 1e-9
+            position[:, 1] = np.where(landed, DRAGON_HALF[1], position[:, 1] + self.dragon_fall * TICK_S)
+        beside = np.abs(position[:, ::2]) - COLUMN
+        near = np.flatnonzero((np.abs(beside) < DRAGON_REACH).all(axis=1))
         if near.size:
-            beside = position[near].copy()
-            beside[:, ::2] -= np.copysign(COLUMN, beside[:, ::2])
-            gap, normal = box_gap(beside, self.dragon_yaw[near], DRAGON_HALF, HALVES[COLUMN_BASE])
+            offset = position[near]
+            offset[:, ::2] -= np.copysign(COLUMN, offset[:, ::2])
+            gap, normal = box_gap(offset, self.dragon_yaw[near], DRAGON_HALF, HALVES[COLUMN_BASE])
             position[near] += push_out(gap)[:, None] * normal
+            self._face_portal(near[gap < 0])
 
     def _refresh_targets(self, enabled: np.ndarray) -> None:
         """Write the centres of moving things, and who is there to be touched."""
@@ -304,16 +311,21 @@ class DungeonRoom:
                 shift[slots[rows]] += out[rows]
 
     def _walls(self, shift: np.ndarray) -> None:
-        """Stop agents at the four walls, which have the last word."""
-        extents = plan_extent(self.yaw, AGENT_HALF)
-        for axis, extent in zip((0, 2), extents, strict=True):
+        """Stop agents at the four walls, which have the last word; as `ground.stop`, along the axes."""
+        velocity = self.velocity
+        for axis, extent in zip((0, 2), plan_extent(self.yaw, AGENT_HALF), strict=True):
             side = self.position[:, axis]
-            gap = WALL - extent - np.abs(side)
-            rows = np.flatnonzero(gap < CONTACT_GAP)
-            if rows.size:
-                normal = np.zeros((len(rows), 3))
-                normal[:, axis] = -np.sign(side[rows])
-                velocity = self.velocity[rows]
-                stop(velocity, normal, gap[rows])
-                self.velocity[rows] = velocity
-                shift[rows, axis] += push_out(gap[rows]) * normal[:, axis]
+            gap = WALL - extent
+            gap -= np.abs(side)
+            near = gap < CONTACT_GAP
+            if near.any():
+                sign = np.sign(side)
+                lack = np.maximum(sign * velocity[:, axis] - np.maximum(gap, 0.0) / TICK_S, 0.0)
+                lack[~near] = 0.0
+                velocity[:, axis] -= sign * lack
+                along = velocity[:, 2 - axis]
+                slip = np.hypot(along, velocity[:, 1])
+                kept = np.maximum(1.0 - BOX_FRICTION * lack / np.maximum(slip, 1e-12), 0.0)
+                along *= kept
+                velocity[:, 1] *= kept
+                shift[:, axis] -= sign * push_out(gap)
