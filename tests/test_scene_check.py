@@ -1,0 +1,146 @@
+"""The contract checker: scenes keep the contract, and each broken rule is found and named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
+
+from mappo_unity.scenes.ball3d import Ball3D
+from mappo_unity.scenes.check import ContractError, check_env, main, random_actions
+
+NAME = "3DBall?team=0"
+Steps = tuple[DecisionSteps, TerminalSteps]
+
+
+class Broken(Ball3D):
+    """3DBall whose steps are altered by `spoil` from the third call of step() on."""
+
+    def __init__(self, spoil: Callable[[Steps], Steps], **options: Any) -> None:
+        super().__init__(num_areas=3, **options)
+        self.spoil = spoil
+        self.calls = 0
+
+    def step(self) -> None:
+        super().step()
+        self.calls += 1
+
+    def get_steps(self, behavior_name: str) -> Steps:
+        steps = super().get_steps(behavior_name)
+        return self.spoil(steps) if self.calls > 2 else steps
+
+
+def copied(steps: DecisionSteps) -> DecisionSteps:
+    return DecisionSteps(
+        [obs.copy() for obs in steps.obs], steps.reward.copy(), steps.agent_id.copy(), steps.action_mask,
+        steps.group_id.copy(), steps.group_reward.copy(),
+    )  # fmt: skip
+
+
+def spoil_decisions(change: Callable[[DecisionSteps], None]) -> Callable[[Steps], Steps]:
+    def spoil(steps: Steps) -> Steps:
+        decisions = copied(steps[0])
+        if len(decisions):
+            change(decisions)
+        return decisions, steps[1]
+
+    return spoil
+
+
+def not_finite(decisions: DecisionSteps) -> None:
+    decisions.obs[0][1, 4] = np.nan
+
+
+def wrong_dtype(decisions: DecisionSteps) -> None:
+    decisions.reward = decisions.reward.astype(np.float64)
+
+
+def repeated_id(decisions: DecisionSteps) -> None:
+    decisions.agent_id[:] = 2
+
+
+def wrong_shape(decisions: DecisionSteps) -> None:
+    decisions.obs[0] = decisions.obs[0][:, :7]
+
+
+def two_ends(steps: Steps) -> Steps:
+    ended = TerminalSteps(
+        [np.zeros((1, 8), np.float32)], np.zeros(1, np.float32), np.zeros(1, bool), np.array([1]),
+        np.array([0]), np.zeros(1, np.float32),
+    )  # fmt: skip
+    return DecisionSteps.empty(Ball3D.BEHAVIORS[0].spec()), ended
+
+
+def other_group(steps: Steps) -> Steps:
+    _, ended = two_ends(steps)
+    return steps[0], TerminalSteps(
+        ended.obs, ended.reward, ended.interrupted, ended.agent_id, np.array([4]), ended.group_reward
+    )
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (spoil_decisions(not_finite), r"3DBall\?team=0, agent 1: sensor VectorSensor_size8 is not finite"),
+        (spoil_decisions(wrong_dtype), "DecisionSteps reward dtype float64, not float32"),
+        (spoil_decisions(repeated_id), "agent 2: twice in one DecisionSteps"),
+        (spoil_decisions(wrong_shape), r"shape \(3, 7\), not \(3, 8\)"),
+        (two_ends, "agent 1: two terminal records without a decision between"),
+        (other_group, "agent 1: ended in group 4, but its decisions were in 0"),
+    ],
+)
+def test_broken_records_are_named(spoil: Callable[[Steps], Steps], message: str) -> None:
+    with pytest.raises(ContractError, match=message):
+        check_env(Broken(spoil), steps=20)
+
+
+def test_accepting_actions_of_agents_that_did_not_ask_is_found() -> None:
+    class Lenient(Ball3D):
+        def set_action_for_agent(self, behavior_name: str, agent_id: int, action: ActionTuple) -> None:
+            pass
+
+    with pytest.raises(ContractError, match="did not ask is accepted"):
+        check_env(Lenient(num_areas=2), steps=5)
+
+
+def test_an_inexact_snapshot_is_found() -> None:
+    class Forgetful(Ball3D):
+        def load_scene_state(self, state: dict[str, Any]) -> None:
+            super().load_scene_state(state)
+            self.ball_spin[:] = self.counter % 7  # differs from one restore to the next
+            self.ball_velocity[:] = self.rng_of_its_own.random(3)
+
+        rng_of_its_own = np.random.default_rng(0)
+
+    with pytest.raises(ContractError, match=r"after set_state\(\) the same actions give other records"):
+        check_env(Forgetful(num_areas=2), steps=40)
+
+
+def test_an_ignored_seed_is_found() -> None:
+    seeds = iter(range(100))
+    with pytest.raises(ContractError, match="the same seed and actions give other records"):
+        check_env(Ball3D(num_areas=2), steps=40, remake=lambda: Ball3D(num_areas=2, seed=next(seeds)))
+
+
+def test_masks_are_obeyed_and_a_full_mask_is_an_error() -> None:
+    spec = Ball3D.BEHAVIORS[0].spec()._replace()
+    spec = spec._replace(action_spec=spec.action_spec.create_discrete((3,)))
+    mask = np.array([[True, True, False], [True, False, True]])
+    zeros = np.zeros(2, np.float32)
+    steps = DecisionSteps([], zeros, np.array([5, 6]), [mask], np.array([0, 0]), zeros)
+    rng = np.random.default_rng(0)
+    assert random_actions(NAME, spec, steps, rng).discrete.tolist() == [[2], [1]]
+    mask[1] = True
+    with pytest.raises(ContractError, match="agent 6: every action of branch 0 is forbidden"):
+        random_actions(NAME, spec, steps, rng)
+
+
+def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["3DBall", "--steps", "200"]) == 0
+    out = capsys.readouterr().out
+    assert "terminal_only_steps" in out and "'get_state/set_state', 'seed'" in out
+    assert main(["4DBall"]) == 1
+    assert "choices: 3DBall" in capsys.readouterr().err
