@@ -22,6 +22,7 @@ SCENES = {
     "StrikersVsGoalie": "soccer:StrikersVsGoalie",
     "DungeonEscape": "dungeon_escape:DungeonEscape",
     "Hallway": "hallway:Hallway",
+    "WallJump": "wall_jump:WallJump",
 }
 """Module and class of every scene, below this package."""
 
