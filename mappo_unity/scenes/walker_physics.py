@@ -14,6 +14,8 @@ from mappo_unity.scenes import walker_body as body
 from mappo_unity.scenes.physics import AreaPhysics
 
 DRAG_KEPT = 1.0 - 0.05 * body.TICK_S  # drag and angular drag of every part, 0.05/s each
+PART_MAX_SPIN = 50.0  # rad/s: set by the parts' script; here of the hips and of every hinge
+UNDRIVEN = 0.03  # share of its damping that a joint without a drive keeps; free, light parts are unstable
 TARGET_MAX_SPIN = 7.0  # rad/s: the engine's limit for bodies that set none
 
 
@@ -76,6 +78,7 @@ class WalkerPhysics:
     def step(self) -> None:
         """Advance one tick, and find all poses."""
         self._areas.qvel[:, :32] *= DRAG_KEPT
+        np.clip(self._areas.qvel[:, 3:32], -PART_MAX_SPIN, PART_MAX_SPIN, out=self._areas.qvel[:, 3:32])
         self._areas.qvel[:, 35:38] *= DRAG_KEPT
         spin = self._areas.qvel[:, 35:38]
         spin *= np.minimum(1, TARGET_MAX_SPIN / np.maximum(np.linalg.norm(spin, axis=1), 1e-9))[:, None]
@@ -146,7 +149,7 @@ class WalkerPhysics:
         error = self.drive_target - self.angle
         twist = np.cos(self.angle[:, _TWIST])
         stiffness = _STIFFNESS * self.drive_on
-        damping = _DAMPING * self.drive_on
+        damping = _DAMPING * np.maximum(self.drive_on, UNDRIVEN)
         error[:, _SWING] = np.sin(error[:, _SWING])
         stiffness[:, _SWING] *= twist * np.cos(self.drive_target[:, _TWIST])
         damping[:, _SWING] *= twist * twist
