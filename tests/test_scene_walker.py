@@ -389,6 +389,31 @@ def test_a_tick_of_the_drives_is_the_implicit_step() -> None:
     assert np.abs(expected).max() > 0.1
 
 
+def test_extreme_actions_stay_stable() -> None:
+    """Full targets with drives switched on and off at random: parts spun past 80 rad/s without damping."""
+    env = Walker(num_areas=64)
+    env.reset()
+    rng = np.random.default_rng(0)
+    fastest = 0.0
+    for _ in range(60):
+        decisions, _ = env.get_steps(NAME)
+        action = np.sign(rng.uniform(-1, 1, (len(decisions), 39))).astype(np.float32)
+        env.set_actions(NAME, ActionTuple(continuous=action))
+        env.step()
+        fastest = max(fastest, float(np.abs(env.physics.spin).max()))
+    assert 10 < fastest < 75
+
+
+def test_fast_parts_are_limited_to_50() -> None:
+    env = Walker(num_areas=1, gravity=0.0)
+    env.reset()
+    areas = env.physics._areas
+    areas.qpos[0, 1] = 5.0
+    areas.qvel[0, 4] = 80.0
+    env.physics.step()
+    assert areas.qvel[0, 4] == pytest.approx(50, rel=0.05)
+
+
 def test_free_fall_with_drag_and_gravity_at_once() -> None:
     env = Walker(num_areas=1)
     env.reset()
