@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -93,7 +95,8 @@ def test_own_model_changes_one_area(per_model: int) -> None:
     assert physics.qvel[:, 1] == pytest.approx(-0.1 - 0.2)
 
 
-def test_infinite_state_names_the_area() -> None:
+def test_infinite_state_names_the_area(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings into a file there
     physics = areas(3)
     physics.qvel[1, 0] = np.inf
     with pytest.raises(FloatingPointError, match="physics of area 1"):
