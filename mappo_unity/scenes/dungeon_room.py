@@ -51,7 +51,9 @@ HALVES = np.array(
         CARRIED_KEY_HALF,
     ]
 )
-REACH = np.hypot(HALVES[:, 0], HALVES[:, 2]) + np.hypot(0.5, 0.5) + CONTACT_GAP
+REACH = np.stack([np.hypot(HALVES[:, 0], HALVES[:, 2])] * 2, axis=1)  # of things that turn, along x and z
+REACH[[COLUMN_BASE, LOCK]] = HALVES[[COLUMN_BASE, LOCK]][:, ::2]
+REACH += np.hypot(0.5, 0.5) + CONTACT_GAP
 TOUCH_GAP = np.where(np.arange(7) == KEY, 0.0, CONTACT_GAP)  # a trigger must overlap
 DRAGON_REACH = 0.85 + np.hypot(0.75, 0.75) + CONTACT_GAP  # of a column's base, along x and z
 FRICTION = {COLUMN_BASE: 0.0, LOCK: BOX_FRICTION, TOMB: BOX_FRICTION}
@@ -272,7 +274,8 @@ class DungeonRoom:
         """Find all touches, bool [N, A, K]; stop agents at solid boxes and at each other."""
         place = self.position.reshape(self.num_areas, NUM_AGENTS, 1, 3)
         offset = (place - self._target).reshape(-1, len(HALVES), 3)
-        near = offset[:, :, 0] ** 2 + offset[:, :, 2] ** 2 < REACH**2
+        near = np.abs(offset[:, :, 0]) < REACH[:, 0]
+        near &= np.abs(offset[:, :, 2]) < REACH[:, 1]
         near &= self._present.reshape(near.shape)
         touching = np.zeros(near.shape, bool)
         slots, things = np.nonzero(near)
