@@ -35,6 +35,9 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--seeds", type=int, default=0, help="also train seeds 0 .. N-1 to the end, default options"
+    )
     arguments = parser.parse_args()
     cfg = compose_config(
         ["env=3DBall", f"seed={arguments.seed}", "log.backends=[]", "log.progress=false"]
@@ -47,6 +50,8 @@ def main() -> None:
     time_to_95(cfg)
     collection(cfg, arguments.repeats)
     updates(cfg, arguments.repeats)
+    for seed in range(arguments.seeds):
+        whole_run(seed)
     print(f"peak resident memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     print(f"load average at the end: {os.getloadavg()[0]:.2f}")
 
@@ -63,6 +68,19 @@ def time_to_95(cfg: Config) -> None:
     print(
         f"mean return {outcome.return_mean:.1f} ({outcome.status}) after {seconds:.1f} s from the first "
         f"environment step, {outcome.agent_steps:,} agent steps, {outcome.agent_steps / seconds:,.0f}/s"
+    )
+
+
+def whole_run(seed: int) -> None:
+    """Train with the default options to the end."""
+    cfg = compose_config([f"seed={seed}", "log.progress=false"]).config
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = Trainer(cfg, Path(folder))
+        outcome = trainer.run()
+        trainer.close()
+    print(
+        f"seed {seed}: mean return {outcome.return_mean:.2f} over the last {cfg.log.return_window} episodes, "
+        f"{outcome.agent_steps:,} agent steps, {outcome.wall_s:.1f} s"
     )
 
 
