@@ -437,6 +437,43 @@ class ExportConfig:
     """File (NAME.onnx) or folder to write; null: beside the checkpoint, under its name."""
 
 
+@dataclass
+class PlayConfig:
+    """Options of a film."""
+
+    run: Optional[str] = None
+    """Run folder (its best checkpoint is played), checkpoint or ONNX file; null: env is played by policy."""
+    env: Optional[str] = None
+    """Environment to play in, a preset in conf/env; null: that of the run."""
+    policy: Optional[str] = None
+    """With env: an ONNX file, or a folder with NAME.onnx for each behavior; null: random actions."""
+    video: Optional[str] = None
+    """File to write, NAME.mp4 or NAME.gif; null: a window on the display."""
+    seconds: float = 20.0
+    """Length of the film, at the scene's own pace."""
+    deterministic: bool = False
+    """Take the most likely action instead of a sampled one."""
+    seed: int = 0
+    """Seed of the environment and the sampling."""
+    width: int = 960
+    """Width of the picture in pixels, even."""
+    height: int = 544
+    """Height of the picture in pixels, even."""
+
+    def __post_init__(self) -> None:
+        _above("seconds", self.seconds, 0)
+        _within("seed", self.seed, 0, 2**31 - 1)
+        for option, size in (("width", self.width), ("height", self.height)):
+            _rule(option, size, 64 <= size <= 4096 and size % 2 == 0, "must be even and from 64 to 4096")
+        if self.run is None and self.env is None:
+            raise ConfigError(
+                "neither run nor env is given: run=FOLDER plays what was trained there, env=NAME random "
+                "actions, env=NAME policy=FILE.onnx an ONNX file"
+            )
+        if self.run is not None and self.policy is not None:
+            raise ConfigError(f"run={self.run} and policy={self.policy} both say who plays: give one of them")
+
+
 def _rule(option: str, value: float | None, holds: bool, rule: str) -> None:
     if value is not None and not (math.isfinite(value) and holds):
         raise ConfigError(f"{option}={value} is out of range: {option} {rule}")

@@ -28,7 +28,7 @@ mirrored algebra is the same algebra (only MuJoCo's quaternions are w first).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -103,6 +103,7 @@ class Scene(BaseEnv):
         self._asked = np.zeros(0, np.int64)
         self._asked_rows: list[np.ndarray] = [self._asked for _ in self.BEHAVIORS]
         self.counter = 0  # the academy's step count: ticks since the start or the last env.reset()
+        self.after_tick: Callable[[], None] | None = None  # called at the end of every tick, to film it
         self._closed = False
 
     # ---- hooks of a scene -------------------------------------------------------------------------------
@@ -361,6 +362,8 @@ class Scene(BaseEnv):
                 self.end_episode(late, interrupted=True)
         self.controllers()
         self.simulate()
+        if self.after_tick is not None:
+            self.after_tick()
 
     def _result(self, behavior: int) -> tuple[DecisionSteps, TerminalSteps]:
         terminals = self._queue.take(behavior)

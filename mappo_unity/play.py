@@ -1,0 +1,161 @@
+"""What mappo-play does: show a policy in its embedded scene, in a video file or in a window.
+
+In: `PlayConfig`. Out: a film, and what was played as a dict. Prints nothing, learns nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from mappo_unity import keys
+from mappo_unity.backend import make_env_function
+from mappo_unity.compose import config_to_play
+from mappo_unity.config import Backend, ConfigError, PlayConfig
+from mappo_unity.evaluate import open_policy
+from mappo_unity.onnx_policy import SUFFIX, OnnxPolicy
+from mappo_unity.policies import ActorPolicy, Policy
+from mappo_unity.runs import CONFIG
+from mappo_unity.scenes.base import Scene
+from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.scenes.drawings.shapes import Camera, Drawing, Shape
+from mappo_unity.video import VideoFile, check_video
+from mappo_unity.window import Window
+
+FRAMES_PER_S = 30  # about: a frame shows a whole number of ticks
+RANDOM = "random"
+
+
+class Screen(Protocol):
+    """What shows frames: a video file or a window."""
+
+    def show(self, shapes: Sequence[Shape], camera: Camera) -> bool:
+        """Show a frame; return whether another one is wanted."""
+        ...
+
+
+def play(cfg: PlayConfig) -> dict[str, Any]:
+    """Show a policy in one area of its scene for `cfg.seconds`.
+
+    Returns:
+        Scene, policy, seconds and frames shown, and the agent episodes that ended with their mean return.
+
+    Raises:
+        ConfigError: no scene of ours, no policy that fits it, no way to draw or to write the file.
+    """
+    video = Path(cfg.video) if cfg.video else None
+    if video is not None:
+        check_video(video)
+    torch.set_num_threads(1)
+    torch.manual_seed(cfg.seed)
+    scene = open_scene(cfg)
+    try:
+        policies = policies_of(cfg, scene)
+        drawing = drawing_of(scene.NAME)
+        pace = Pace(drawing, cfg.seconds)
+        first, size = _camera(drawing, scene), (cfg.width, cfg.height)
+        if video is not None:
+            with VideoFile(video, first, size, pace.fps) as file:
+                figures = _roll(scene, policies, Projector(scene, drawing, pace, file))
+        else:
+            with Window(first, size, pace.fps, f"mappo-play {scene.NAME}") as window:
+                figures = _roll(scene, policies, Projector(scene, drawing, pace, window))
+    finally:
+        scene.close()
+    return {"scene": scene.NAME, "policy": cfg.run or cfg.policy or RANDOM, "video": cfg.video} | figures
+
+
+def open_scene(cfg: PlayConfig) -> Scene:
+    """Open one area of the scene that a run was trained in, or that `cfg.env` names."""
+    options = config_to_play(Path(cfg.run or ""), cfg.env).env
+    if options.backend is not Backend.embedded:
+        raise ConfigError(
+            f"mappo-play shows embedded scenes, but this environment has env.backend={options.backend.value}"
+        )
+    scene = make_env_function(replace(options, num_areas=1))(cfg.seed)
+    assert isinstance(scene, Scene)
+    return scene
+
+
+def policies_of(cfg: PlayConfig, scene: Scene) -> dict[str, Policy]:
+    """Return the policy of every behavior, checked against it."""
+    where = cfg.run or cfg.policy or RANDOM
+    folder = Path(where)
+    if folder.is_dir() and not (folder / CONFIG).is_file() and any(folder.glob(f"*{SUFFIX}")):
+        paths = {name: folder / f"{keys.policy_name(name)}{SUFFIX}" for name in scene.behavior_specs}
+        policies: dict[str, Policy] = {
+            name: OnnxPolicy(path, cfg.deterministic, cfg.seed) for name, path in paths.items()
+        }
+    else:
+        policies = dict.fromkeys(scene.behavior_specs, open_policy(where, cfg.deterministic, cfg.seed))
+    for name, policy in policies.items():
+        if isinstance(policy, (ActorPolicy, OnnxPolicy)):
+            policy.check(name, scene.behavior_specs[name])
+    return policies
+
+
+class Pace:
+    """How many ticks a frame shows, frames a second, and frames in all."""
+
+    def __init__(self, drawing: Drawing, seconds: float) -> None:
+        self.ticks = max(1, round(1 / (FRAMES_PER_S * drawing.tick_s)))
+        self.fps = 1 / (self.ticks * drawing.tick_s)
+        self.frames = max(1, round(seconds * self.fps))
+
+
+class Projector:
+    """Show a scene on a screen, every few ticks, until the film is over."""
+
+    def __init__(self, scene: Scene, drawing: Drawing, pace: Pace, screen: Screen) -> None:
+        self.scene, self.drawing, self.pace, self.screen = scene, drawing, pace, screen
+        self.ticks = self.frames = 0
+        self.over = False
+
+    def tick(self) -> None:
+        """Show the scene if a frame is due."""
+        self.ticks += 1
+        if self.over or self.ticks % self.pace.ticks:
+            return
+        shapes, camera = self.drawing.shapes(self.scene, 0), _camera(self.drawing, self.scene)
+        wanted = self.screen.show(shapes, camera)
+        self.frames += 1
+        self.over = not wanted or self.frames >= self.pace.frames
+
+
+def _roll(scene: Scene, policies: dict[str, Policy], projector: Projector) -> dict[str, Any]:
+    """Play until the film is over."""
+    scene.after_tick = projector.tick
+    returns: list[float] = []
+    running: dict[tuple[str, int], float] = {}
+    scene.reset()
+    while not projector.over:
+        for name, policy in policies.items():
+            decisions, terminals = scene.get_steps(name)
+            rewards = (terminals.reward + terminals.group_reward).tolist()
+            for agent, reward in zip(terminals.agent_id.tolist(), rewards):
+                if (name, agent) in running:
+                    returns.append(running.pop((name, agent)) + reward)
+            agents = decisions.agent_id.tolist()
+            if isinstance(policy, OnnxPolicy):
+                policy.forget(name, [agent for agent in agents if (name, agent) not in running])
+            rewards = (decisions.reward + decisions.group_reward).tolist()
+            for agent, reward in zip(agents, rewards):
+                running[name, agent] = running.get((name, agent), 0.0) + reward
+            if agents:
+                scene.set_actions(name, policy.act(name, decisions, scene.behavior_specs[name]))
+        scene.step()
+    mean = sum(returns) / len(returns) if returns else None
+    return {
+        "seconds": projector.frames / projector.pace.fps,
+        "frames": projector.frames,
+        "episodes": len(returns),
+        "mean_return": mean,
+    }
+
+
+def _camera(drawing: Drawing, scene: Scene) -> Camera:
+    return drawing.camera(scene, 0) if callable(drawing.camera) else drawing.camera

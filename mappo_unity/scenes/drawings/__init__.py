@@ -1,0 +1,28 @@
+"""How the embedded scenes look: `drawing_of(name)` returns a scene's shapes and its camera.
+
+In: a scene. Out: plain shapes (shapes.py). One module a scene; none of them draws or imports a renderer.
+"""
+
+from __future__ import annotations
+
+import importlib
+
+from mappo_unity.config import ConfigError
+from mappo_unity.scenes.drawings.shapes import Drawing
+
+DRAWINGS = {
+    "3DBall": "ball3d",
+    "Basic": "basic",
+    "GridFoodCollector": "grid_food_collector",
+}
+"""Module of every scene's drawing, below this package; each holds `DRAWING`."""
+
+
+def drawing_of(scene: str) -> Drawing:
+    """Return the drawing of a scene; raises ConfigError where there is none."""
+    if scene not in DRAWINGS:
+        raise ConfigError(f"there is no drawing of a scene {scene!r}; choices: {', '.join(DRAWINGS)}")
+    module = importlib.import_module(f"{__name__}.{DRAWINGS[scene]}")
+    drawing = module.DRAWING
+    assert isinstance(drawing, Drawing)
+    return drawing

@@ -1,0 +1,72 @@
+"""A window that shows shapes at the pace of the clock.
+
+In: shapes and a camera. Out: pictures on the display. Knows no scene.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any
+
+import mujoco
+
+from mappo_unity.config import ConfigError
+from mappo_unity.render import Stage
+from mappo_unity.scenes.drawings.shapes import Camera, Shape
+
+
+class Window:
+    """Show shapes in a window; a context manager.
+
+    Args:
+        camera: the first view.
+        size: width and height in pixels.
+        fps: frames a second; `show` waits for the time of its frame.
+        title: of the window.
+
+    Raises:
+        ConfigError: there is no display, or no window can be opened on it.
+    """
+
+    def __init__(self, camera: Camera, size: tuple[int, int], fps: float, title: str) -> None:
+        if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise ConfigError("there is no display for a window here; video=FILE.mp4 or .gif writes a film")
+        import glfw
+
+        self._glfw: Any = glfw
+        self._window: Any = None
+        if glfw.init():
+            glfw.window_hint(glfw.SAMPLES, 4)
+            self._window = glfw.create_window(*size, title, None, None)
+        if not self._window:
+            glfw.terminate()
+            raise ConfigError("no window can be opened on the display; video=FILE.mp4 or .gif writes a film")
+        glfw.make_context_current(self._window)
+        self._stage = Stage(camera, *size)
+        self._context = mujoco.MjrContext(self._stage.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_WINDOW.value, self._context)
+        self._frame_s = 1.0 / fps
+        self._due = time.monotonic()
+
+    def show(self, shapes: Sequence[Shape], camera: Camera) -> bool:
+        """Show a frame when its time has come; return False once the window was closed."""
+        size = self._glfw.get_framebuffer_size(self._window)
+        mujoco.mjr_render(mujoco.MjrRect(0, 0, *size), self._stage.fill(shapes, camera), self._context)
+        self._due = max(self._due + self._frame_s, time.monotonic() - self._frame_s)
+        time.sleep(max(0.0, self._due - time.monotonic()))
+        self._glfw.swap_buffers(self._window)
+        self._glfw.poll_events()
+        return not self._glfw.window_should_close(self._window)
+
+    def __enter__(self) -> Window:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._context.free()
+        self._glfw.terminate()
