@@ -70,6 +70,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return serve(Player(make_env, known.scene, log, png=not known.no_png), known.port, log)
 
 
+def help_text() -> str:
+    """Return what mappo-player --help prints."""
+    return _parser().format_help()
+
+
 def env_function(scene: str, num_areas: int | None = None, params: dict[str, float] | None = None) -> MakeEnv:
     """Return the function (seed, number of areas or None) -> BaseEnv of a scene or a factory.
 

@@ -13,7 +13,7 @@ reset only hands out the first observation of the next episode; the scene itself
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,6 +28,14 @@ from mappo_unity.rounds import BehaviorRounds, Episode
 from mappo_unity.slots import SlotTable
 
 MAX_SILENT_STEPS = 100_000  # BaseEnv steps in which nobody asks before that is called an error
+
+
+class CutOff(NamedTuple):
+    """Episodes that a failed player took along."""
+
+    round: int  # the round in which they ended, see `UnityEnv.rounds`
+    behavior: str
+    slots: np.ndarray  # bool [G, A]
 
 
 class UnityEnv(EnvBase):
@@ -55,6 +63,7 @@ class UnityEnv(EnvBase):
         death_masking: bool = True,
     ) -> None:
         super().__init__(device=None, batch_size=torch.Size([]), run_type_checks=False)
+        self.is_closed = False  # EnvBase says True of environments that wrap nothing
         self._make_env = make_env
         self._limits = (max_teams, max_team_size)
         self.action_limit = float(action_limit)
@@ -77,6 +86,20 @@ class UnityEnv(EnvBase):
         out = {name: behavior.finished for name, behavior in self._behaviors.items()}
         for behavior in self._behaviors.values():
             behavior.finished = []
+        return out
+
+    _cut_off: list[CutOff]
+    rounds: int = 0  # rounds played since the environment was opened
+
+    @property
+    def restarts(self) -> int | None:
+        """How often players were started again; None for a BaseEnv that is no player."""
+        return getattr(self.base_env, "restarts", None)
+
+    def pop_cut_off(self) -> list[CutOff]:
+        """Return the episodes cut off by failed players since the last call."""
+        out: list[CutOff] = self._cut_off
+        self._cut_off = []
         return out
 
     def get_state(self) -> dict[str, Any] | None:
@@ -117,6 +140,8 @@ class UnityEnv(EnvBase):
             behavior.begin_round()
         self._untouched = False
         self._play_until_asked()
+        self._note_cut_off()
+        self.rounds += 1
         return TensorDict({self.entry_of[name]: self._next(b) for name, b in self._behaviors.items()}, [])
 
     def _set_seed(self, seed: int | None) -> None:
@@ -126,6 +151,7 @@ class UnityEnv(EnvBase):
     def _open(self, seed: int) -> None:
         self.base_env = self._make_env(int(seed))
         self._behaviors: dict[str, BehaviorRounds] = {}
+        self._cut_off = []
         self.base_env.reset()
         self._first_results()
         self._untouched = True
@@ -144,8 +170,13 @@ class UnityEnv(EnvBase):
             if step_first or attempt:
                 self.base_env.step()
             asked = False
+            cut_off = getattr(
+                self.base_env, "cut_off", None
+            )  # a restarted player's agents, see link.restarts
             for name, behavior in self._behaviors.items():
                 decision, terminal = self.base_env.get_steps(name)
+                if cut_off and name in cut_off:
+                    behavior.drop(cut_off[name])
                 behavior.add(decision, terminal)
                 asked = asked or len(decision) > 0
             if asked:
@@ -157,6 +188,12 @@ class UnityEnv(EnvBase):
             )
         for behavior in self._behaviors.values():
             behavior.end_round()
+
+    def _note_cut_off(self) -> None:
+        for name, behavior in self._behaviors.items():
+            if behavior.cut_off.any():
+                slots = behavior.cut_off.reshape(self._shape(behavior)).copy()
+                self._cut_off.append(CutOff(self.rounds, name, slots))
 
     def _first_results(self) -> None:
         """Read the behaviors and how many teams and agents they have from the first records."""

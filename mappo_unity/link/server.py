@@ -10,7 +10,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from typing import Any
 
 import grpc
@@ -41,9 +41,8 @@ class Link:
         self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._peer: str | None = None
         self._closing = False
-        self._server = grpc.server(
-            ThreadPoolExecutor(2, "player"), options=(("grpc.so_reuseport", 0), *OPTIONS)
-        )
+        self._threads = _DaemonThreads(2)
+        self._server = grpc.server(self._threads, options=(("grpc.so_reuseport", 0), *OPTIONS))
         self._server.add_generic_rpc_handlers((_Handler(self._exchange),))
         try:
             self.port = self._server.add_insecure_port(f"{ADDRESS}:{port}")
@@ -83,12 +82,14 @@ class Link:
     def say_quit(self) -> None:
         """Tell the player to leave, now or when it calls next."""
         self._closing = True
-        self._answers.put(message(STATUS_QUIT))
+        for _ in range(2):  # one for each thread that may wait
+            self._answers.put(message(STATUS_QUIT))
 
     def close(self) -> None:
         """Stop listening; the port is free again."""
         self.say_quit()
         self._server.stop(0).wait(5)
+        self._threads.shutdown()
 
     def _exchange(self, request: bytes, context: Any) -> bytes:
         """Run in a thread of gRPC: hand a request over and wait for its answer."""
@@ -100,13 +101,7 @@ class Link:
         if self._closing:
             return message(STATUS_QUIT)
         self._requests.put(request)
-        while True:
-            try:
-                return self._answers.get(timeout=5)
-            except queue.Empty:
-                # A trainer that ended without closing must not be held back by this thread.
-                if self._closing or not threading.main_thread().is_alive():
-                    return message(STATUS_QUIT)
+        return self._answers.get()
 
 
 class _Handler(grpc.GenericRpcHandler):
@@ -117,3 +112,32 @@ class _Handler(grpc.GenericRpcHandler):
 
     def service(self, handler_call_details: Any) -> Any:
         return self._method if handler_call_details.method == METHOD else None
+
+
+class _DaemonThreads(Executor):
+    """A pool of daemon threads: one that waits for an answer does not keep the trainer from ending."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._work: queue.SimpleQueue[tuple[Future, Callable[[], Any]] | None] = queue.SimpleQueue()
+        for number in range(count):
+            threading.Thread(target=self._run, name=f"player-call-{number}", daemon=True).start()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
+        """Run a call in one of the threads."""
+        future: Future = Future()
+        self._work.put((future, lambda: fn(*args, **kwargs)))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let the threads end when they have no work left."""
+        for _ in range(self._count):
+            self._work.put(None)
+
+    def _run(self) -> None:
+        while (item := self._work.get()) is not None:
+            future, call = item
+            try:
+                future.set_result(call())
+            except BaseException as error:  # as concurrent.futures does: it belongs to the caller
+                future.set_exception(error)

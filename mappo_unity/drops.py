@@ -1,0 +1,60 @@
+"""Take episodes that were cut off by a failure out of a batch.
+
+In: a batch as collected, what `UnityEnv.pop_cut_off` says. Out: the batch, in which those episodes'
+decisions are nobody's: they are not learned from and do not count. Knows nothing of players.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from mappo_unity import keys
+from mappo_unity.unity_env import CutOff, UnityEnv
+
+
+def drop_episodes(batch: TensorDictBase, cuts: Sequence[CutOff], env: UnityEnv) -> int:
+    """Set `acting` and `departed` to False in every row of the cut episodes; return how many rows acted.
+
+    Args:
+        batch: ``[T]``, one entry a policy name, whose last row is the environment's last round.
+        cuts: what was cut off in rounds of this batch.
+    """
+    dropped = 0
+    for cut in cuts:
+        name = keys.policy_name(cut.behavior)
+        side = env.sides[name].index(cut.behavior) if len(env.sides[name]) > 1 else None
+        done = _of_side(batch.get(("next", name, keys.DONE)), side)
+        last = batch.shape[0] - env.rounds + cut.round
+        rows = episode_rows(done, last, torch.from_numpy(cut.slots).unsqueeze(-1))
+        for key in (keys.ACTING, keys.DEPARTED):
+            flags = batch.get((name, key)).clone()
+            own = _of_side(flags, side)
+            dropped += int((own & rows).sum()) if key == keys.ACTING else 0
+            own &= ~rows
+            batch.set((name, key), flags)
+    return dropped
+
+
+def episode_rows(done_T: Tensor, last: int, slots: Tensor) -> Tensor:
+    """Return the rows of the episodes that end in row `last`, bool ``[T, ...]``.
+
+    Args:
+        done_T: bool ``[T, ...]``, where episodes ended.
+        slots: bool ``[...]``, whose episodes are meant.
+    """
+    rows = torch.zeros_like(done_T)
+    playing = slots.clone()
+    for t in range(last, -1, -1):
+        if t < last:
+            playing &= ~done_T[t]
+        rows[t] = playing
+    return rows
+
+
+def _of_side(values: Tensor, side: int | None) -> Tensor:
+    """Return one side's view of an entry; where several share a policy they are stacked, ``[T, S, G, A]``."""
+    return values if side is None else values[:, side]
