@@ -1,7 +1,8 @@
 """The commands: the only place that prints. Heavy imports happen inside them.
 
 Exit codes: 0 done, 1 an error of ours (with its traceback) or a failed job of a sweep, 2 a mistake
-in the options, 130 and 143 ended by SIGINT and SIGTERM.
+in the options, 3 an environment that failed for good (a checkpoint is written first), 130 and 143
+ended by SIGINT and SIGTERM.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.config import Config, ConfigError, EvalConfig, ExportConfig
+from mappo_unity.config import Config, ConfigError, EnvironmentFailure, EvalConfig, ExportConfig
 
 _SIGNALS = {2: "SIGINT", 15: "SIGTERM"}
 
@@ -31,6 +32,16 @@ def export_main(arguments: list[str] | None = None) -> int:
     return _run_command("mappo-export", _export_command, _export_help, arguments)
 
 
+def player_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-player: serve a scene as a Unity player; return the exit code."""
+    return _run_command("mappo-player", _player_command, _player_help, arguments)
+
+
+def doctor_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-doctor: look for what keeps a player or an environment from working; return the exit code."""
+    return _run_command("mappo-doctor", _doctor_command, _doctor_help, arguments)
+
+
 def _run_command(
     name: str, command: Callable[[list[str]], int], help_text: Callable[[], str], arguments: list[str] | None
 ) -> int:
@@ -48,6 +59,9 @@ def _run_command(
     except ConfigError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2
+    except EnvironmentFailure as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 3
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return 130
@@ -69,6 +83,30 @@ def _export_help() -> str:
     from mappo_unity.help import export_help
 
     return export_help(ExportConfig)
+
+
+def _player_help() -> str:
+    from mappo_unity.player import help_text
+
+    return help_text()
+
+
+def _player_command(lines: list[str]) -> int:
+    from mappo_unity.player import main
+
+    return main(lines)
+
+
+def _doctor_help() -> str:
+    from mappo_unity.doctor import help_text
+
+    return help_text()
+
+
+def _doctor_command(lines: list[str]) -> int:
+    from mappo_unity.doctor import diagnose
+
+    return diagnose(lines, print)
 
 
 def _train_command(lines: list[str]) -> int:
