@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.config import Config, ConfigError, EnvironmentFailure, EvalConfig, ExportConfig
+from mappo_unity.config import Config, ConfigError, EnvironmentFailure, EvalConfig, ExportConfig, PlayConfig
 
 _SIGNALS = {2: "SIGINT", 15: "SIGTERM"}
 
@@ -25,6 +25,11 @@ def train_main(arguments: list[str] | None = None) -> int:
 def eval_main(arguments: list[str] | None = None) -> int:
     """Run mappo-eval: play episodes with a trained policy; return the exit code."""
     return _run_command("mappo-eval", _eval_command, _eval_help, arguments)
+
+
+def play_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-play: film a policy in its scene; return the exit code."""
+    return _run_command("mappo-play", _play_command, _play_help, arguments)
 
 
 def export_main(arguments: list[str] | None = None) -> int:
@@ -77,6 +82,12 @@ def _eval_help() -> str:
     from mappo_unity.help import eval_help
 
     return eval_help(EvalConfig)
+
+
+def _play_help() -> str:
+    from mappo_unity.help import play_help
+
+    return play_help(PlayConfig)
 
 
 def _export_help() -> str:
@@ -204,6 +215,18 @@ def _eval_command(lines: list[str]) -> int:
 
     report.console().print(report.eval_table(result))
     print(report.json_line(result))
+    return 0
+
+
+def _play_command(lines: list[str]) -> int:
+    from mappo_unity.compose import check_factory, compose_plain, config_to_play
+
+    options = compose_plain(lines, PlayConfig)
+    check_factory(config_to_play(Path(options.run or ""), options.env))
+    from mappo_unity.play import play
+    from mappo_unity.report import play_line
+
+    print(play_line(play(options)))
     return 0
 
 

@@ -41,6 +41,19 @@ Example:
   mappo-eval run=outputs/3DBall/2026-11-20_12-00-00 episodes=100 deterministic=true
 """
 
+PLAY_USAGE = """\
+Show a policy in its embedded scene: in a window, or in a video file, which needs no display.
+
+Usage:
+  mappo-play run=RUN [video=FILE]           a run folder (its best checkpoint) or a checkpoint
+  mappo-play env=NAME [policy=ONNX]         random actions, an ONNX file or a folder of NAME.onnx
+  mappo-play --help | --version
+
+Examples:
+  mappo-play run=outputs/3DBall/2026-11-20_12-00-00 video=3DBall.mp4
+  mappo-play env=SoccerTwos policy=SoccerTwos.onnx video=match.gif seconds=8 width=480 height=272
+"""
+
 EXPORT_USAGE = """\
 Write a trained policy as an ONNX file, which Unity loads: one file for each behavior name.
 
@@ -62,6 +75,11 @@ def train_help(schema: type) -> str:
 def eval_help(schema: type) -> str:
     """Return the help of mappo-eval: usage, options."""
     return f"{EVAL_USAGE}\n{option_text(schema)}"
+
+
+def play_help(schema: type) -> str:
+    """Return the help of mappo-play: usage, options."""
+    return f"{PLAY_USAGE}\n{option_text(schema)}"
 
 
 def export_help(schema: type) -> str:

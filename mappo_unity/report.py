@@ -90,6 +90,16 @@ def eval_table(result: dict[str, Any]) -> Table:
     return table
 
 
+def play_line(result: dict[str, Any]) -> str:
+    """Return what mappo-play says at its end."""
+    line = f"{result['video']}: " if result["video"] else ""
+    line += f"{result['seconds']:.1f} s of {result['scene']} played by {result['policy']}, "
+    line += f"{result['frames']} frames"
+    if result["episodes"]:
+        line += f"; {result['episodes']} agent episodes ended, mean return {result['mean_return']:.4g}"
+    return line
+
+
 def json_line(result: dict[str, Any]) -> str:
     """Return the figures of an evaluation as one line of JSON; not-a-number becomes null."""
     return json.dumps(_finite(result), default=str, allow_nan=False)
