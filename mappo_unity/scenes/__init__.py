@@ -23,6 +23,7 @@ SCENES = {
     "DungeonEscape": "dungeon_escape:DungeonEscape",
     "Hallway": "hallway:Hallway",
     "WallJump": "wall_jump:WallJump",
+    "Pyramids": "pyramids:Pyramids",
 }
 """Module and class of every scene, below this package."""
 
