@@ -78,18 +78,7 @@ def axis_gaps(
     world's axes. Returns gaps ``[5, n]`` (negative: overlap) and unit normals ``[5, n, 3]`` that point from
     the other box to the box.
     """
-    half, other = np.asarray(half).T, np.asarray(other_half).T
-    turn = yaw if other_yaw is None else yaw - other_yaw
-    sin, cos = np.sin(turn), np.cos(turn)
-    x, y, z = offset.T if other_yaw is None else _turned(offset.T, -other_yaw)
-    along = np.stack([x, y, z, x * cos - z * sin, x * sin + z * cos])
-    abs_sin, abs_cos = np.abs(sin), np.abs(cos)
-    reach = np.empty_like(along)
-    reach[0] = other[0] + half[0] * abs_cos + half[2] * abs_sin
-    reach[1] = other[1] + half[1]
-    reach[2] = other[2] + half[0] * abs_sin + half[2] * abs_cos
-    reach[3] = half[0] + other[0] * abs_cos + other[2] * abs_sin
-    reach[4] = half[2] + other[0] * abs_sin + other[2] * abs_cos
+    along, reach, sin, cos = _projections(offset, yaw, half, other_half, other_yaw)
     sign = np.where(along < 0, -1.0, 1.0)
     normals = np.zeros((5, 3, len(offset)))
     normals[0, 0], normals[1, 1], normals[2, 2] = sign[0], sign[1], sign[2]
@@ -98,6 +87,18 @@ def axis_gaps(
     if other_yaw is not None:
         normals = _turned(normals.swapaxes(0, 1), other_yaw).swapaxes(0, 1)
     return np.abs(along) - reach, normals.swapaxes(1, 2)
+
+
+def boxes_overlap(
+    offset: np.ndarray,
+    yaw: np.ndarray,
+    half: np.ndarray | tuple[float, float, float],
+    other_half: np.ndarray | tuple[float, float, float],
+    other_yaw: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return where upright boxes overlap, bool ``[n]``; arguments as for `axis_gaps`."""
+    along, reach, _, _ = _projections(offset, yaw, half, other_half, other_yaw)
+    return (np.abs(along) < reach).all(axis=0)
 
 
 def box_gap(
@@ -175,6 +176,30 @@ def stop_pair(
 def push_out(gap: np.ndarray) -> np.ndarray:
     """Return how far ``[n]``, m, the engine moves overlapping bodies apart in one tick."""
     return np.minimum(PUSH_OUT * np.maximum(-gap, 0.0), MAX_PUSH_OUT)
+
+
+def _projections(
+    offset: np.ndarray,
+    yaw: np.ndarray,
+    half: np.ndarray | tuple[float, float, float],
+    other_half: np.ndarray | tuple[float, float, float],
+    other_yaw: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return offsets and summed extents along the five axes, ``[5, n]``, and sin, cos of the relative yaw."""
+    half, other = np.asarray(half).T, np.asarray(other_half).T
+    turn = yaw if other_yaw is None else yaw - other_yaw
+    sin, cos = np.sin(turn), np.cos(turn)
+    along, reach = np.empty((5, len(offset))), np.empty((5, len(offset)))
+    x, y, z = along[:3] = offset.T if other_yaw is None else _turned(offset.T, -other_yaw)
+    along[3] = x * cos - z * sin
+    along[4] = x * sin + z * cos
+    abs_sin, abs_cos = np.abs(sin), np.abs(cos)
+    reach[0] = other[0] + half[0] * abs_cos + half[2] * abs_sin
+    reach[1] = other[1] + half[1]
+    reach[2] = other[2] + half[0] * abs_sin + half[2] * abs_cos
+    reach[3] = half[0] + other[0] * abs_cos + other[2] * abs_sin
+    reach[4] = half[2] + other[0] * abs_sin + other[2] * abs_cos
+    return along, reach, sin, cos
 
 
 def _turned(vector: np.ndarray, yaw: np.ndarray) -> np.ndarray:

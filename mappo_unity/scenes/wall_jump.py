@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.scenes.base import Scene
-from mappo_unity.scenes.ground import TICK_S, heading
+from mappo_unity.scenes.ground import TICK_S
 from mappo_unity.scenes.specs import Behavior, Parameter, Sensor
 from mappo_unity.scenes.wall_jump_bodies import WallJumpBodies
 from mappo_unity.scenes.wall_jump_sensors import observe_rays
@@ -83,7 +83,7 @@ class WallJump(Scene):
         """
         if not self.started:
             self.configuration[:] = self.rng.integers(0, CONFIGURATIONS, self.num_areas)
-        slots = np.flatnonzero(self.configuration != NOTHING_PENDING)
+        slots = (self.configuration != NOTHING_PENDING).nonzero()[0]
         if not slots.size:
             return
         drawn = self.configuration[slots]
@@ -121,12 +121,12 @@ class WallJump(Scene):
         self._frames = None
         self.agents.reward += TICK_REWARD
         grounded = bodies.grounded()
-        forward, right = heading(bodies.yaw)
-        sideways = action[2] > 0
-        direction = np.where(
-            sideways[:, None], SIDE[action[2]][:, None] * right, FORWARD[action[0]][:, None] * forward
-        )
-        direction *= np.where(grounded, 1.0, IN_AIR)[:, None]
+        sideways = SIDE[action[2]]
+        ahead = FORWARD[action[0]] * (sideways == 0)  # a step to the side replaces it
+        speed, sin, cos = np.where(grounded, 1.0, IN_AIR), np.sin(bodies.yaw), np.cos(bodies.yaw)
+        direction = np.zeros((self.num_slots, 3))
+        direction[:, 0] = speed * (ahead * sin + sideways * cos)
+        direction[:, 2] = speed * (ahead * cos - sideways * sin)
         starts = (action[3] == 1) & (self.jump_left_s <= 0)
         if starts.any():
             starts &= bodies.stands_over()
@@ -136,7 +136,7 @@ class WallJump(Scene):
         self.drive = RUN_SPEED * direction
         jumps = self.jump_left_s > 0
         if jumps.any():
-            self._steer_jumps(np.flatnonzero(jumps), direction)
+            self._steer_jumps(jumps.nonzero()[0], direction)
         falling = ~jumps & ~grounded
         self.acceleration = self.parameters["gravity"] + FALLING * falling
         self.jump_left_s -= np.float32(TICK_S)

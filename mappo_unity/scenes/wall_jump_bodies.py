@@ -16,8 +16,8 @@ from mappo_unity.scenes.ground import (
     BOX_FRICTION,
     CONTACT_GAP,
     TICK_S,
-    axis_gaps,
     box_gap,
+    boxes_overlap,
     push_out,
     slide,
     stop,
@@ -28,7 +28,7 @@ AGENT_HALF = (0.5, 0.5, 0.5)
 BLOCK_HALF = (1.5, 1.0, 1.5)
 BLOCK_Y = 1.5
 FLOOR_Y = 0.45
-FLOOR_X, FLOOR_Z = (-10.5, 10.5), (-14.5, 6.5)
+FLOOR_HALF, FLOOR_Z = 10.5, -4.0
 WALL_Z, WALL_HALF_X, WALL_HALF_Z = -1.98, 10.0, 0.75
 GOAL_CENTRE, GOAL_HALF = np.array([6.37, 2.99, 2.93]), (2.0, 2.5, 2.0)
 AGENT_INVERSE_MASS = np.full(3, 1 / 25)  # 1/kg
@@ -38,6 +38,9 @@ SOLVER_ROUNDS = 2  # the contacts of an agent depend on each other
 HELD_GAP = 1e-3  # m: a block nearer to the wall cannot be pushed towards it
 FEET_HALF = (0.475, 0.5, 0.475)  # of the large ground check, 0.05 m below the agent's centre
 _REACH = 0.8  # m: more than a turned agent's half diagonal, the contact gap and the feet's shift
+_BLOCK_REACH = np.array(BLOCK_HALF) + _REACH
+_GOAL_REACH = np.array(GOAL_HALF) + _REACH
+_WALL_CENTRE = np.array([0.0, 0.0, WALL_Z])
 _DOWN_5_CM = np.array([0.0, -0.05, 0.0])
 _ARRAYS = ("position", "velocity", "yaw", "block", "block_velocity", "wall_height")
 
@@ -94,8 +97,7 @@ class WallJumpBodies:
         on_floor = self.position[:, 1] + _DOWN_5_CM[1] - FEET_HALF[1] < FLOOR_Y
         rows, _, offset, half = self._near(~on_floor)
         if rows.size:
-            gap = axis_gaps(offset + _DOWN_5_CM, self.yaw[rows], FEET_HALF, half)[0].max(axis=0)
-            on_floor[rows[gap < 0]] = True
+            on_floor[rows[boxes_overlap(offset + _DOWN_5_CM, self.yaw[rows], FEET_HALF, half)]] = True
         return on_floor
 
     def fallen(self) -> np.ndarray:
@@ -107,9 +109,9 @@ class WallJumpBodies:
     def in_goal(self) -> np.ndarray:
         """Return the areas whose agent overlaps the goal volume, int [n]."""
         offset = self.position - GOAL_CENTRE
-        near = np.flatnonzero((np.abs(offset) < (2.8, 3.1, 2.8)).all(axis=1))
+        near = (np.abs(offset) < _GOAL_REACH).all(axis=1).nonzero()[0]
         if near.size:
-            near = near[box_gap(offset[near], self.yaw[near], AGENT_HALF, GOAL_HALF)[0] < 0]
+            near = near[boxes_overlap(offset[near], self.yaw[near], AGENT_HALF, GOAL_HALF)]
         return near
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -136,7 +138,7 @@ class WallJumpBodies:
         if not (rows.size or stuck.size):
             return None, floor_gap
         gap, normal = box_gap(offset, self.yaw[rows], AGENT_HALF, half)
-        touch = np.flatnonzero(gap < CONTACT_GAP)
+        touch = (gap < CONTACT_GAP).nonzero()[0]
         wall, block = touch[touch < num_wall], touch[touch >= num_wall]
         self._stop(self.velocity, rows[wall], gap[wall], normal[wall])
         self._stop(self.block_velocity, stuck, stuck_gap, stuck_normal)
@@ -146,7 +148,7 @@ class WallJumpBodies:
         if block.size:
             agents, way, held = rows[block], normal[block], stuck_gap < HELD_GAP
             mobility = self._block_mobility(agents, way, stuck[held], stuck_normal[held])
-            between = wall[np.isin(rows[wall], agents)]
+            between = wall[np.isin(rows[wall], agents)] if wall.size else wall
             for _ in range(SOLVER_ROUNDS):
                 velocity, block_velocity = self.velocity[agents], self.block_velocity[agents]
                 stop_pair(velocity, block_velocity, way, gap[block], AGENT_INVERSE_MASS, mobility)
@@ -163,7 +165,8 @@ class WallJumpBodies:
         self, agents: np.ndarray, way: np.ndarray, held: np.ndarray, wall_normal: np.ndarray
     ) -> np.ndarray:
         """Return blocks' inverse masses [n, 3], with 0 where an agent pushes its block into the wall."""
-        mobility = np.tile(BLOCK_INVERSE_MASS, (agents.size, 1))
+        mobility = np.empty((agents.size, 3))
+        mobility[:] = BLOCK_INVERSE_MASS
         if held.size:
             normal = np.zeros_like(self.block)
             normal[held] = wall_normal
@@ -181,20 +184,21 @@ class WallJumpBodies:
         wall = (np.abs(position[:, 2] - WALL_Z) < WALL_HALF_Z + _REACH) & (wall_top > FLOOR_Y)
         wall &= position[:, 1] < wall_top + _REACH
         offset = position - self.block
-        block = (np.abs(offset) < np.array(BLOCK_HALF) + _REACH).all(axis=1)
+        block = (np.abs(offset) < _BLOCK_REACH).all(axis=1)
         if among is not None:
             wall, block = wall & among, block & among
-        walls, blocks = np.flatnonzero(wall), np.flatnonzero(block)
+        walls, blocks = wall.nonzero()[0], block.nonzero()[0]
         rows = np.concatenate([walls, blocks])
-        offset = np.concatenate([position[walls] - (0.0, 0.0, WALL_Z), offset[blocks]])
-        half = np.tile(BLOCK_HALF, (rows.size, 1))
+        offset = np.concatenate([position[walls] - _WALL_CENTRE, offset[blocks]])
+        half = np.empty((rows.size, 3))
+        half[walls.size :] = BLOCK_HALF
         half[: walls.size] = WALL_HALF_X, 0.0, WALL_HALF_Z
         half[: walls.size, 1] = wall_top[walls]
         return rows, walls.size, offset, half
 
     def _blocks_at_wall(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the blocks in contact with the wall: areas [n], gaps [n], normals [n, 3]."""
-        offset = self.block - (0.0, 0.0, WALL_Z)
+        offset = self.block - _WALL_CENTRE
         reach = (WALL_HALF_X + BLOCK_HALF[0], WALL_HALF_Z + BLOCK_HALF[2])
         gap_x, gap_z = np.abs(offset[:, 0]) - reach[0], np.abs(offset[:, 2]) - reach[1]
         gap = np.maximum(gap_x, gap_z)
@@ -218,4 +222,4 @@ class WallJumpBodies:
 
 
 def _over_floor(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    return (x >= FLOOR_X[0]) & (x <= FLOOR_X[1]) & (z >= FLOOR_Z[0]) & (z <= FLOOR_Z[1])
+    return (np.abs(x) <= FLOOR_HALF) & (np.abs(z - FLOOR_Z) <= FLOOR_HALF)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mappo_unity.scenes.rays import RaySensor, cast_rectangles, cast_upright_boxes, flat_radius
+from mappo_unity.scenes.rays import RaySensor, cast_boxes, cast_rectangles, flat_radius
 from mappo_unity.scenes.wall_jump_bodies import (
     BLOCK_HALF,
     FLOOR_Y,
@@ -44,7 +44,10 @@ def observe_rays(
         origin[..., ::2], direction[..., ::2], radius, centre[..., ::2], half[..., ::2], skip_gap=TOUCH_GAP
     )
     origin, direction = UPWARD.casts(position, yaw)
-    upward = cast_upright_boxes(origin, direction, UPWARD.cast_radius, centre, half, skip_gap=TOUCH_GAP)
+    # rays that start above the block rise away from it: nearly always they need no cast at it
+    seen = 3 if (origin[..., 1] < high[:, :, 2] + UPWARD.cast_radius).any() else 2
+    local, half = (origin - centre)[:, :, :seen], half[:, :, :seen]
+    upward = cast_boxes(local, direction, UPWARD.cast_radius, half, TOUCH_GAP)
     level[no_wall, :, 0] = np.inf
     upward[no_wall, :, 0] = np.inf
-    return UPWARD.encode(upward, TAGS), LEVEL.encode(level, TAGS)
+    return UPWARD.encode(upward, TAGS[:seen]), LEVEL.encode(level, TAGS)

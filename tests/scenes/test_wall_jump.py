@@ -324,6 +324,16 @@ def test_upward_rays() -> None:
     np.testing.assert_array_equal(frames(env)[0][0], [0, 0, 0, 1, 1])
 
 
+def test_upward_rays_of_a_low_agent_see_the_block() -> None:
+    """Deep in the floor, at y 0.2, they start 2.7 - 0.5 m high and meet the block below its top at 2.5."""
+    env = wall_jump(2)
+    place(env, 0.0, 0.95, -11.0)
+    env.bodies.block[:, ::2] = (0.0, -8.0)
+    assert frames(env)[0][0, 3] == 1
+    env.bodies.position[:, 1] = 0.2
+    np.testing.assert_array_equal(frames(env)[0][0, :4], [0, 0, 1, 0])
+
+
 def test_a_touched_block_is_skipped() -> None:
     env = wall_jump()
     place(env, 0.0, 0.95, -8.0, wall=8.0)
