@@ -3,3 +3,7 @@
 `messages` and `rows`: bytes on the wire. `server`, `process`, `client`: a trainer's side, one running player
 as a BaseEnv. `restarts`, `several`: players that fail, and many of them. Knows nothing of learning.
 """
+
+from mappo_unity.protobuf import install
+
+install()

@@ -9,7 +9,6 @@ where the log is. A failure raises `PlayerFailure`, after which the player is go
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +29,10 @@ from mappo_unity.link.messages import STATUS_OK
 from mappo_unity.link.process import PlayerProcess
 from mappo_unity.link.server import Link, LinkTimeout
 
+NOBODY_ASKS = (
+    "every Agent needs a DecisionRequester (or a call of RequestDecision), Behavior Type Default, and an "
+    "active object"
+)
 CLOSE_S = 5.0  # how long a player may take to leave before it is killed
 
 logger = logging.getLogger(__name__)
@@ -77,6 +80,7 @@ class UnityPlayer(BaseEnv):
         self.options, self.seed = options, seed
         parameters, engine = EnvironmentParametersChannel(), EngineConfigurationChannel()
         engine.set_configuration_parameters(**options.engine)
+        self._engine = engine
         for name, value in options.parameters.items():
             parameters.set_float_parameter(name, value)
         self._channels = SideChannelManager([parameters, engine, *(side_channels or [])])
@@ -164,6 +168,10 @@ class UnityPlayer(BaseEnv):
         except (MalformedMessage, UnityEnvironmentException, ValueError, IndexError) as error:
             raise self._failure(f"sent a malformed message: {error}") from error
 
+    def set_time_scale(self, scale: float) -> None:
+        """Let the player run so much faster than real time, from the next step on."""
+        self._engine.set_configuration_parameters(time_scale=scale)
+
     # ---- BaseEnv ------------------------------------------------------------------------------------------
 
     @property
@@ -230,11 +238,10 @@ class UnityPlayer(BaseEnv):
     def _receive(self) -> Any:
         from google.protobuf.message import DecodeError
 
-        begin = time.monotonic()
         try:
             data = self._link.receive(self.options.timeout_s, self._check_alive)
         except LinkTimeout as error:
-            raise self._failure(self._silence(time.monotonic() - begin)) from error
+            raise self._failure(self._silence()) from error
         try:
             answer = messages.parse(data)
         except DecodeError as error:
@@ -249,10 +256,11 @@ class UnityPlayer(BaseEnv):
             when = "while it started" if self.handshake is None else "while the training ran"
             raise self._failure(f"ended {when}: {how}")
 
-    def _silence(self, waited_s: float) -> str:
-        if self.handshake is not None:
-            return f"did not answer within env.timeout_s={self.options.timeout_s:g}"
+    def _silence(self) -> str:
         limit = f"within env.timeout_s={self.options.timeout_s:g}"
+        if self.handshake is not None:
+            hint = "" if self._decoders else f": no agent asks for a decision; {NOBODY_ASKS}"
+            return f"did not answer {limit}{hint}"
         if self.process is None:
             return (
                 f"did not connect to port {self._link.port} {limit}: press Play in a scene whose agents have "

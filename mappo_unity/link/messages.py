@@ -42,8 +42,12 @@ _AS_BYTES = {
     "AgentActionProto": ("continuous_actions", "vector_actions_deprecated"),
 }
 
-OPTIONS = (("grpc.max_send_message_length", -1), ("grpc.max_receive_message_length", -1))
-"""gRPC options of both ends: pictures of many agents exceed its limit of 4 MB."""
+OPTIONS = (
+    ("grpc.max_send_message_length", -1),
+    ("grpc.max_receive_message_length", -1),
+    ("grpc.enable_http_proxy", 0),
+)
+"""gRPC options of both ends: pictures of many agents exceed its limit of 4 MB; the way is never a proxy's."""
 
 
 @cache
