@@ -1,0 +1,117 @@
+"""Matches: outcomes, sides, intervals."""
+
+import numpy as np
+import pytest
+from fakes import behavior_spec
+from mlagents_envs.base_env import ActionSpec, BaseEnv, DecisionSteps, TerminalSteps
+
+from mappo_unity.config import ConfigError
+from mappo_unity.matches import Score, count, find_sides, play_matches, wilson
+from mappo_unity.policies import RandomPolicy
+from mappo_unity.rounds import Episode
+from mappo_unity.scenes import make_scene
+
+SIDES = ("Duel?team=1", "Duel?team=0")
+
+
+class Duel(BaseEnv):
+    """One decision a match, two agents a side: the side whose members choose 1 more often wins."""
+
+    def __init__(self, seed):
+        self.choices = {name: np.zeros(2, int) for name in SIDES}
+
+    behavior_specs = property(lambda self: {name: behavior_spec(1, ActionSpec(0, (2,))) for name in SIDES})
+
+    def reset(self):
+        self.over = False
+
+    def step(self):
+        self.over = True
+
+    def set_actions(self, name, action):
+        self.choices[name] = action.discrete[:, 0]
+
+    def set_action_for_agent(self, *args):
+        raise NotImplementedError
+
+    def close(self):
+        pass
+
+    def get_steps(self, name):
+        spec, side = self.behavior_specs[name], SIDES.index(name)
+        ids = np.array([2 * side, 2 * side + 1], np.int32)
+        groups = np.full(2, side + 1, np.int32)
+        obs, zeros = [np.zeros((2, 1), np.float32)], np.zeros(2, np.float32)
+        decision = DecisionSteps(obs, zeros, ids, [np.zeros((2, 2), bool)], groups, zeros)
+        if not self.over:
+            return decision, TerminalSteps.empty(spec)
+        other = SIDES[1 - side]
+        won = np.sign(self.choices[name].sum() - self.choices[other].sum())
+        reward = np.full(2, won, np.float32)
+        return decision, TerminalSteps(obs, zeros, np.zeros(2, bool), ids, groups, reward)
+
+
+class Always:
+    def __init__(self, choice):
+        self.choice = choice
+
+    def act(self, behavior, steps, spec):
+        action = spec.action_spec.empty_action(len(steps))
+        action.add_discrete(np.full((len(steps), 1), self.choice, np.int32))
+        return action
+
+
+def test_the_better_player_wins_from_both_sides():
+    scores = play_matches(Duel, Always(1), Always(0), 20, seed=0)
+    assert list(scores) == ["Duel?team=0", "Duel?team=1"]
+    assert all((s.wins, s.draws, s.losses) == (10, 0, 0) for s in scores.values())
+    scores = play_matches(Duel, Always(0), Always(1), 9, seed=0)
+    assert [s.losses for s in scores.values()] == [5, 4]
+    assert all(s.draws == s.matches for s in play_matches(Duel, Always(1), Always(1), 4, seed=0).values())
+
+
+def test_figures_and_the_interval_of_wilson():
+    figures = Score(wins=81, draws=10, losses=9, decisions=400).figures()
+    assert figures["won_of_decided"] == 0.9 and figures["goal_difference"] == 0.72
+    assert figures["mean_decisions"] == 4.0
+    # 81 of 90: Wilson's interval by an independent calculator
+    assert (figures["won_of_decided_low95"], figures["won_of_decided_high95"]) == pytest.approx(
+        (0.8208, 0.9465), abs=1e-3
+    )
+    assert wilson(0, 10)[0] == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(wilson(0, 0)).all()
+
+
+def test_a_team_counts_once_a_match():
+    def end(agent, group, result):
+        return Episode(agent, 0.0, result, 5, False, group)
+
+    rows = [
+        end(0, 1, 0.9),
+        end(2, 1, 0.9),
+        end(4, 3, -1.0),
+        end(0, 1, -1.0),
+        end(6, 3, -1.0),
+        end(2, 1, -1.0),
+    ]
+    score = count(rows, grouped=True)
+    assert (score.wins, score.draws, score.losses, score.decisions) == (1, 0, 2, 15)
+
+
+def test_scenes_with_one_side_are_refused():
+    with pytest.raises(ConfigError, match="two sides.*has 1: 3DBall"):
+        find_sides(make_scene("3DBall", num_areas=1))
+
+
+def test_random_play_in_the_soccer_scenes_is_even():
+    for name in ("SoccerTwos", "StrikersVsGoalie"):
+        scores = play_matches(
+            lambda seed, name=name: make_scene(name, seed=seed, num_areas=2),
+            RandomPolicy(0),
+            RandomPolicy(1),
+            4,
+            0,
+        )
+        assert sum(s.matches for s in scores.values()) == 4
+        if name == "StrikersVsGoalie":  # the goalie's side cannot score
+            assert scores["Goalie?team=1"].wins == 0 and scores["Striker?team=0"].losses == 0
