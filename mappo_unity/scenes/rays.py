@@ -17,7 +17,7 @@ agent's own collider needs no special care.
     frame = eyes.encode(np.concatenate([balls, walls], axis=2), tags)  # float32 [N, eyes.size]
 
 For horizontal rays `cast_rectangles` is the same as `cast_upright_boxes` in two dimensions, and faster;
-`cast_faces` is faster still where only one side of a wall can be seen.
+`Faces` are faster still where only one side of a wall can be seen.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ import numpy as np
 from mappo_unity.scenes.specs import Sensor
 
 _TINY = 1e-12
+_FAR = 1e9  # m: past the end of any wall
 
 
 @dataclass(frozen=True)
@@ -193,41 +194,38 @@ def cast_rectangles(
     return np.where(touching | (np.asarray(radius) <= 0), np.inf, travel)
 
 
-def cast_faces(
-    origin: np.ndarray,
-    direction: np.ndarray,
-    radius: np.ndarray | float,
-    begin: np.ndarray,
-    end: np.ndarray,
-    skip_gap: float = 0.0,
-) -> np.ndarray:
-    """Return the travel of a disc of `radius` until it meets the front of a wall, all in the plane (x, z).
+class Faces:
+    """Walls of which discs and rays meet only one side, all in the plane (x, z).
 
-    `begin`, `end` [..., 2]: the wall's face, its front to the right of the way from `begin` to `end` (seen
-    from above, x right, z up). Ends that stand free are to be cast as discs of radius 0. A wall seen from
-    behind is not met; one nearer than `skip_gap` at the start is not reported.
+    `begin`, `end` [..., 2]: each wall's face; its front is to the right of the way from `begin` to `end`
+    (seen from above, x right, z up). Ends that stand free are to be cast as spheres of reach `radius`.
     """
-    along, length = _unit(end - begin)
-    front = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    offset = origin - begin
-    height = _dot(offset, front) - radius
-    closing = -_dot(direction, front)
-    meets = (closing > _TINY) & (height >= 0) & ~touches_walls(origin, radius + skip_gap, begin, end)
-    travel = np.where(meets, height / np.where(meets, closing, 1.0), np.inf)
-    with np.errstate(invalid="ignore"):
-        place = _dot(offset, along) + travel * _dot(direction, along)
-    return np.where((place >= 0) & (place <= length), travel, np.inf)
 
+    def __init__(self, begin: np.ndarray, end: np.ndarray) -> None:
+        self._begin = begin
+        self._length = np.sqrt(_dot(end - begin, end - begin))
+        self._along = (end - begin) / self._length[..., None]
+        self._front = np.stack([self._along[..., 1], -self._along[..., 0]], axis=-1)
 
-def touches_walls(
-    point: np.ndarray, reach: np.ndarray | float, begin: np.ndarray, end: np.ndarray
-) -> np.ndarray:
-    """Return whether points [..., 2] are nearer than `reach` to walls from `begin` to `end` [..., 2]."""
-    along, length = _unit(end - begin)
-    offset = point - begin
-    place = _dot(offset, along)
-    beside = place - np.clip(place, 0.0, length)
-    return beside**2 + (_dot(offset, offset) - place**2) < np.square(reach)
+    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: np.ndarray | float) -> np.ndarray:
+        """Return the travel of a disc of `radius` until it meets the front of a wall, ends excepted.
+
+        A wall that the disc overlaps or has passed is not met; see `touches` for the ends and for gaps.
+        """
+        offset = origin - self._begin
+        height = _dot(offset, self._front) - radius
+        closing = -_dot(direction, self._front)
+        meets = (closing > _TINY) & (height >= 0)
+        travel = np.where(meets, height / np.where(meets, closing, 1.0), _FAR)
+        place = _dot(offset, self._along) + travel * _dot(direction, self._along)
+        return np.where(meets & (place >= 0) & (place <= self._length), travel, np.inf)
+
+    def touches(self, point: np.ndarray, reach: np.ndarray | float) -> np.ndarray:
+        """Return whether points [..., 2] are nearer than `reach` to walls, their ends included."""
+        offset = point - self._begin
+        place = _dot(offset, self._along)
+        beside = place - np.minimum(np.maximum(place, 0.0), self._length)
+        return beside**2 + (_dot(offset, offset) - place**2) < np.square(reach)
 
 
 def cast_upright_boxes(
@@ -341,12 +339,6 @@ def _to_box(vector: np.ndarray, yaw: np.ndarray | float) -> np.ndarray:
     x, z = vector[..., 0], vector[..., -1]
     middle = [np.broadcast_to(vector[..., 1], (x * c).shape)] if vector.shape[-1] == 3 else []
     return np.stack([x * c - z * s, *middle, x * s + z * c], axis=-1)
-
-
-def _unit(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit vectors, and their lengths."""
-    length = np.sqrt(_dot(vector, vector))
-    return vector / np.maximum(length, _TINY)[..., None], length
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -34,72 +34,49 @@ class Contacts(NamedTuple):
 class Bodies:
     """Hold the bodies' velocities, and solve contacts between them.
 
-    `velocity` float64 [2, M] x, z; `spin` float64 [M] about y, rad/s, clockwise seen from above.
+    `velocity` float64 [2, M] x, z; `spin` float64 [M] about y, rad/s, clockwise seen from above;
+    `inverse_mass` float64 [M], 1/kg.
     """
 
     def __init__(self, num_balls: int, num_agents: int, ball: tuple[float, float], agent_mass: float) -> None:
+        """`ball`: mass in kg and radius in m."""
         num = num_balls + num_agents + 1
         mass, radius = ball
         self.num_balls = num_balls
         self.velocity = np.zeros((2, num))
         self.spin = np.zeros(num)
-        self.inverse_mass = np.full(num, 1 / agent_mass)
-        self.inverse_mass[:num_balls] = 1 / mass
-        self.inverse_mass[-1] = 0
-        # rubbing also turns the ball, a solid sphere: 1/m + r^2 / (2/5 m r^2)
-        self._rub_weight = self.inverse_mass.copy()
-        self._rub_weight[:num_balls] *= 3.5
-        self._lever = np.zeros(num)  # from centre to contact; agents do not turn
-        self._lever[:num_balls] = radius
-        self._spin_gain = np.zeros(num)
-        self._spin_gain[:num_balls] = 2.5 / (mass * radius)
+        # inverse mass; that of rubbing, which also turns a ball, a solid sphere: 1/m + r^2 / (2/5 m r^2);
+        # lever from centre to contact; spin gained by rubbing: r / (2/5 m r^2). Agents do not turn.
+        self.constants = np.zeros((4, num))
+        self.constants[:2] = 1 / agent_mass
+        self.constants[:, :num_balls] = np.array([1 / mass, 3.5 / mass, radius, 2.5 / (mass * radius)])[
+            :, None
+        ]
+        self.constants[:, -1] = 0
+        self.inverse_mass = self.constants[0]
 
     def solve(self, contacts: Contacts, tick_s: float) -> np.ndarray:
         """Stop or bounce approaching pairs and rub them; return which contacts bounce, bool [n]."""
-        i, j, normal_x, normal_z, gap = contacts
-        approach = (self.velocity[0, j] - self.velocity[0, i]) * normal_x
-        approach += (self.velocity[1, j] - self.velocity[1, i]) * normal_z
-        bounces = (approach > BOUNCE_SPEED) & (i < self.num_balls)
-        leave_speed = np.where(bounces, RESTITUTION * approach, np.maximum(gap, 0) * (-1 / tick_s))
-        shared = self._shared(i, j)
+        rows = _Rows(self, contacts, tick_s)
+        shared = self._shared(contacts.i, contacts.j)
         if not shared.any():
-            self._iterate(_Rows(self, contacts, leave_speed, slice(None)))
-            return bounces
+            rows.iterate()
+            return rows.bounces
         alone = np.flatnonzero(~shared)
         if alone.size:
-            self._iterate(_Rows(self, contacts, leave_speed, alone))
-        ranks = [_Rows(self, contacts, leave_speed, rows) for rows in self._ranks(contacts, shared)]
+            rows.part(alone).iterate()
+        ranks = [rows.part(rank) for rank in self._ranks(contacts, shared)]
         for _ in range(ITERATIONS):
-            if max([self._iterate(rows) for rows in ranks]) < _SETTLED:
+            if max([np.abs(rank.iterate()).max() for rank in ranks]) < _SETTLED:
                 break
-        return bounces
-
-    def _iterate(self, rows: _Rows) -> float:
-        """Apply one iteration to contacts without common bodies; return the largest change of an impulse."""
-        velocity, spin = self.velocity, self.spin
-        i, j, normal_x, normal_z = rows.i, rows.j, rows.normal_x, rows.normal_z
-        x = velocity[0, i] - velocity[0, j]
-        z = velocity[1, i] - velocity[1, j]
-        pressed = np.maximum(rows.press + (rows.leave_speed - x * normal_x - z * normal_z) * rows.mass, 0)
-        slip = z * normal_x - x * normal_z + spin[i] * rows.lever  # along (-normal_z, normal_x)
-        limit = FRICTION * pressed
-        rubbed = np.minimum(np.maximum(rows.rub - slip * rows.rub_mass, -limit), limit)
-        press, rub = pressed - rows.press, rubbed - rows.rub
-        rows.press, rows.rub = pressed, rubbed
-        x = press * normal_x - rub * normal_z
-        z = press * normal_z + rub * normal_x
-        velocity[0, i] += x * rows.weight_i
-        velocity[1, i] += z * rows.weight_i
-        velocity[0, j] -= x * rows.weight_j
-        velocity[1, j] -= z * rows.weight_j
-        spin[i] += rub * rows.spin_gain
-        return float(np.abs(press).max())
+        return rows.bounces
 
     def _shared(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """Return which contacts have a body in common with another one, the pitch excepted."""
-        count = np.bincount(i, minlength=len(self.spin)) + np.bincount(j, minlength=len(self.spin))
+        count = np.bincount(np.concatenate([i, j]), minlength=len(self.spin))
         count[-1] = 0
-        return (count[i] > 1) | (count[j] > 1)
+        many = count > 1
+        return many[i] | many[j]
 
     def _ranks(self, contacts: Contacts, shared: np.ndarray) -> list[np.ndarray]:
         """Return rows of the shared contacts: the first of every field, the second of every field, ..."""
@@ -112,17 +89,46 @@ class Bodies:
 
 
 class _Rows:
-    """Some contacts without common bodies: what an iteration needs, and the impulses so far."""
+    """Some contacts: what an iteration needs, and the impulses so far, `press` and `rub`, kg m/s [n]."""
 
-    def __init__(
-        self, bodies: Bodies, contacts: Contacts, leave_speed: np.ndarray, rows: slice | np.ndarray
-    ) -> None:
-        self.i, self.j = contacts.i[rows], contacts.j[rows]
-        self.normal_x, self.normal_z = contacts.normal_x[rows], contacts.normal_z[rows]
-        self.leave_speed = leave_speed[rows]
-        self.weight_i, self.weight_j = bodies.inverse_mass[self.i], bodies.inverse_mass[self.j]
+    def __init__(self, bodies: Bodies, contacts: Contacts, tick_s: float) -> None:
+        self.velocity, self.spin = bodies.velocity, bodies.spin
+        self.i, self.j, self.normal_x, self.normal_z, gap = contacts
+        x, z = self.velocity[:, self.i] - self.velocity[:, self.j]
+        approach = -x * self.normal_x - z * self.normal_z
+        self.bounces = (approach > BOUNCE_SPEED) & (self.i < bodies.num_balls)
+        self.leave_speed = np.where(self.bounces, RESTITUTION * approach, np.maximum(gap, 0) * (-1 / tick_s))
+        self.weight_i, rub_weight, self.lever, self.spin_gain = bodies.constants[:, self.i]
+        self.weight_j = bodies.inverse_mass[self.j]
         self.mass = 1 / (self.weight_i + self.weight_j)
-        self.rub_mass = 1 / (bodies._rub_weight[self.i] + self.weight_j)
-        self.lever, self.spin_gain = bodies._lever[self.i], bodies._spin_gain[self.i]
-        self.press: np.ndarray | float = 0.0
-        self.rub: np.ndarray | float = 0.0
+        self.rub_mass = 1 / (rub_weight + self.weight_j)
+        self.press = self.rub = np.zeros(len(gap))
+
+    def part(self, rows: np.ndarray) -> _Rows:
+        """Return these rows alone."""
+        part = object.__new__(_Rows)
+        part.velocity, part.spin = self.velocity, self.spin
+        for name, value in vars(self).items():
+            if name not in ("velocity", "spin"):
+                setattr(part, name, value[rows])
+        return part
+
+    def iterate(self) -> np.ndarray:
+        """Apply one iteration, if no two contacts share a body; return the changes of `press`."""
+        velocity, spin, i, j = self.velocity, self.spin, self.i, self.j
+        normal_x, normal_z = self.normal_x, self.normal_z
+        x, z = velocity[:, i] - velocity[:, j]
+        pressed = np.maximum(self.press + (self.leave_speed - x * normal_x - z * normal_z) * self.mass, 0)
+        slip = z * normal_x - x * normal_z + spin[i] * self.lever  # along (-normal_z, normal_x)
+        limit = FRICTION * pressed
+        rubbed = np.minimum(np.maximum(self.rub - slip * self.rub_mass, -limit), limit)
+        press, rub = pressed - self.press, rubbed - self.rub
+        self.press, self.rub = pressed, rubbed
+        x = press * normal_x - rub * normal_z
+        z = press * normal_z + rub * normal_x
+        velocity[0, i] += x * self.weight_i
+        velocity[1, i] += z * self.weight_i
+        velocity[0, j] -= x * self.weight_j
+        velocity[1, j] -= z * self.weight_j
+        spin[i] += rub * self.spin_gain
+        return press

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.scenes.soccer_contacts import Bodies, Contacts
-from mappo_unity.scenes.soccer_pitch import BALL_HEIGHT, GOAL_FLOOR_X, MARGIN, Pitch
+from mappo_unity.scenes.soccer_pitch import BALL_HEIGHT, GOAL_FLOOR_X, MARGIN, POST_X, Gaps, Pitch
 
 TICK_S = 0.02
 AGENT_RADIUS, AGENT_MASS = 0.5, 50.0  # m, kg
@@ -27,6 +27,7 @@ MAX_SPIN = 7.0  # rad/s: the engine's limit for bodies that set none
 KICK_SPEED = 2000 * TICK_S / BALL_MASS  # m/s: a force of 2000 N for one tick
 PUSH_OUT, MAX_PUSH_OUT = 0.8, 10.0 * TICK_S  # share of a penetration removed in a tick; at most 10 m/s
 GOAL_LINE_X = GOAL_FLOOR_X - (BALL_RADIUS**2 - BALL_HEIGHT**2) ** 0.5  # of a ball that meets the goal's floor
+GOAL_NEAR_X = min(POST_X) - BALL_RADIUS - MARGIN  # a ball nearer to the middle touches no part of a goal
 SLIP_SHARE = 2 / 7  # of the ball's way at most lost to its rub on the floor: solid sphere, slip to roll
 SLIP_WAY = 0.35 * PUSH_OUT * (BALL_RADIUS - BALL_HEIGHT)  # m in a tick: friction times push-out
 
@@ -52,7 +53,8 @@ class SoccerPhysics:
         self.touching = np.zeros((num_agents, num_fields), bool)
         radius = np.where(np.arange(bodies[0]) == 0, BALL_RADIUS, AGENT_RADIUS)
         self._radius = np.repeat(radius, num_fields)
-        self._limits = self.pitch.limits(radius[:, None])
+        self._no_goals = np.zeros(num_fields, np.int64)
+        self._gaps: Gaps | None = None  # of `position`; None: bodies were placed or stopped since
         self._first, self._second = np.array(list(combinations(range(bodies[0]), 2))).T
         reach = radius[self._first] + radius[self._second] + MARGIN
         self._reach_squared = (reach**2)[:, None]
@@ -62,6 +64,7 @@ class SoccerPhysics:
         self.position[0, body, fields] = x
         self.position[1, body, fields] = z
         self.velocity[:, body, fields] = 0
+        self._gaps = None
         if body == 0:
             self.spin[fields] = 0
 
@@ -91,6 +94,7 @@ class SoccerPhysics:
         """Restore what `get_state` returned."""
         for name in _STATE:
             getattr(self, name)[...] = state[name]
+        self._gaps = None
 
     def _accelerate(self, drive: np.ndarray) -> None:
         velocity, kick = self.velocity, self.kick
@@ -113,7 +117,6 @@ class SoccerPhysics:
         touching = close[: self.num_agents]
         begun = touching & ~self.touching
         self.touching = touching
-        near = self.pitch.near(position[0], position[1], self._limits)
         parts = []
         if close.any():
             pair, field = np.nonzero(close)
@@ -122,11 +125,12 @@ class SoccerPhysics:
             gap = distance - self._radius[i] - self._radius[j]
             x, z = away[:, pair, field] / distance
             parts.append(Contacts(i, j, x, z, gap))
-        if near.any():
-            body = np.flatnonzero(near)
-            x, z = self._flat(position)[:, body]
-            row, x, z, gap = self.pitch.contacts(x, z, self._radius[body])
-            parts.append(Contacts(body[row], np.full(len(row), self._last), x, z, gap))
+        x, z = self._flat(position)
+        if self._gaps is None:
+            self._gaps = self.pitch.gaps(x, z, self._radius)
+        body, x, z, gap = self.pitch.contacts(x, z, self._gaps)
+        if body.size:
+            parts.append(Contacts(body, np.full(len(body), self._last), x, z, gap))
         if len(parts) == 1:
             return parts[0], begun
         return (Contacts(*map(np.concatenate, zip(*parts, strict=True))) if parts else _NO_CONTACTS), begun
@@ -138,8 +142,9 @@ class SoccerPhysics:
         the engine's position iterations only.
         """
         moves = self._bodies.velocity * TICK_S
-        way = np.sqrt((moves[:, : self.num_fields] ** 2).sum(axis=0)) + 1e-12
-        moves[:, : self.num_fields] *= 1 - np.minimum(SLIP_SHARE, SLIP_WAY / way)
+        x, z = ball = moves[:, : self.num_fields]
+        way = np.sqrt(x * x + z * z) + 1e-12
+        ball *= 1 - np.minimum(SLIP_SHARE, SLIP_WAY / way)
         if bounces is not None:
             i, j, normal_x, normal_z, gap = contacts
             closing = (moves[0, j] - moves[0, i]) * normal_x + (moves[1, j] - moves[1, i]) * normal_z
@@ -159,19 +164,19 @@ class SoccerPhysics:
 
         A body that was in contact at the start slides on instead of losing the rest of its way.
         """
-        near = self.pitch.near(self.position[0], self.position[1], self._limits)
-        if not near.any():
+        begin, end = self._flat(start), self._flat(self.position)
+        before, self._gaps = self._gaps, self.pitch.gaps(end[0], end[1], self._radius)
+        assert before is not None
+        hits, share = self.pitch.way(begin, end, before, self._gaps, self._radius)
+        body, normal_x, normal_z, gap = hits
+        if not body.size:
             return
-        body = np.flatnonzero(near)
-        (x, z), (to_x, to_z) = self._flat(start)[:, body], self._flat(self.position)[:, body]
-        share, (row, normal_x, normal_z, gap) = self.pitch.way(x, z, to_x, to_z, self._radius[body])
-        if not row.size:
-            return
-        body, share, x, z, to_x, to_z = (each[row] for each in (body, share, x, z, to_x, to_z))
-        slides = gap - normal_x * (to_x - x) - normal_z * (to_z - z) < MARGIN
-        position = self._flat(self.position)
-        position[0, body] = np.where(slides, to_x - gap * normal_x, x + share * (to_x - x))
-        position[1, body] = np.where(slides, to_z - gap * normal_z, z + share * (to_z - z))
+        step_x, step_z = end[:, body] - begin[:, body]
+        slides = gap - normal_x * step_x - normal_z * step_z < MARGIN
+        back = share - 1
+        end[0, body] += np.where(slides, -gap * normal_x, back * step_x)
+        end[1, body] += np.where(slides, -gap * normal_z, back * step_z)
+        self._gaps = None
         pitch = np.full(len(body), self._last)
         self._bodies.solve(Contacts(body, pitch, normal_x, normal_z, np.zeros(len(body))), TICK_S)
 
@@ -194,12 +199,15 @@ class SoccerPhysics:
     def _goals(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Count goal parts that balls touch; a ball is stopped at the line, where the engine stops it."""
         ball = self.position[:, 0]
+        if np.abs(ball[0]).max() < GOAL_NEAR_X:
+            return self._no_goals, self._no_goals
         over = np.flatnonzero(np.abs(ball[0]) > GOAL_LINE_X)
         if over.size:
             begin = start[:, 0, over]
             to_line = np.copysign(GOAL_LINE_X, ball[0, over]) - begin[0]
             step = ball[:, over] - begin
             ball[:, over] = begin + step * np.clip(to_line / step[0], 0, 1)
+            self._gaps = None
         return self.pitch.goals(ball[0], ball[1], BALL_RADIUS)
 
     def _flat(self, position: np.ndarray) -> np.ndarray:

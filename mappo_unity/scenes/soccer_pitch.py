@@ -30,13 +30,24 @@ GOAL_FLOOR_X, GOAL_FLOOR_Z = 15.5, 4.25  # front edge and half-width of the goal
 BALL_HEIGHT = 0.5  # of the ball's centre above the goals' floors
 BLOCK_X, BLOCK_Z = 15.01, 3.957  # inner face and half-width of the block that closes a blue goal
 _ROUNDING = 1e-6  # m: a disc less deep than this has not hit anything
-_EDGE = 3  # the feature that is a vertical edge, not a face
+_CORNER, _MOUTH, _EDGE, _BLOCK = 1, 2, 3, 5  # features: side, corner, net's side, mouth's edge, back, block
+_NORMAL_X = np.array([0.0, -_C, 0.0, 0.0, -1.0, -1.0])
+_NORMAL_Z = np.array([-1.0, -_S, -1.0, 0.0, 0.0, 0.0])
+
+
+class Gaps(NamedTuple):
+    """Distances of discs from the pitch's features, m, inf where not faced; negative: penetration."""
+
+    gap: np.ndarray
+    """[5, n]: long side, corner wall, the mouth's face (net's side, or block), its front edge, net's back."""
+    past_end: np.ndarray
+    """Whether the corner wall has ended where the disc is, bool [n]; the gap is then that from its plane."""
 
 
 class Faced(NamedTuple):
-    """Surfaces that discs face: row of the disc int64, unit normal off the surface, gap in m; all [k]."""
+    """Features that discs touch: number of the disc int64, unit normal off the surface, gap in m; all [k]."""
 
-    row: np.ndarray
+    disc: np.ndarray
     normal_x: np.ndarray
     normal_z: np.ndarray
     gap: np.ndarray
@@ -47,53 +58,65 @@ class Pitch:
 
     def __init__(self, blue_closed: bool = False) -> None:
         self.blue_closed = blue_closed
-        closed = np.array([blue_closed, False])
-        # the mouth, by end: a face (the net's side, or the block), its start, and its front edge
-        self._mouth_x = np.where(closed, 1.0, 0.0)  # outward normal: along x for a block, along z for a net
-        self._mouth_offset = np.where(closed, BLOCK_X, NET_Z)
-        self._edge_x = np.where(closed, BLOCK_X, POST_X)
-        self._edge_z = np.where(closed, BLOCK_Z, NET_Z)
-        self._back = np.where(closed, np.inf, BACK_X)
 
-    def limits(self, radius: np.ndarray) -> np.ndarray:
-        """Return what discs' |z|, corner distance and |x| pass near a surface, [3, *radius.shape]."""
-        return np.stack([SIDE_Z - radius, CORNER_OFFSET - radius, self._edge_x.min() - radius]) - MARGIN
+    def gaps(self, x: np.ndarray, z: np.ndarray, radius: np.ndarray) -> Gaps:
+        """Return the distances of n discs from everything that they face."""
+        ax, az = np.abs(x), np.abs(z)
+        purple = x > 0
+        gap = np.empty((5, len(x)))
+        np.subtract(SIDE_Z, az, out=gap[0])
+        np.subtract(CORNER_OFFSET, _C * ax + _S * az, out=gap[1])
+        edge_x, edge_z = self._edge(purple)
+        along_x, along_z = ax - edge_x, az - edge_z
+        beside = along_x > 0
+        gap[2] = np.where(beside, NET_Z - az, np.inf)
+        gap[4] = np.where(az < GOAL_FLOOR_Z, np.where(purple, BACK_X[1], BACK_X[0]) - ax, np.inf)
+        if self.blue_closed:
+            beside = np.where(purple, beside, along_z < 0)
+            gap[2] = np.where(purple, gap[2], np.where(beside, BLOCK_X - ax, np.inf))
+            gap[4, ~purple] = np.inf
+        gap[3] = np.where(beside, np.inf, np.sqrt(along_x * along_x + along_z * along_z))
+        gap -= radius
+        return Gaps(gap, _S * ax - _C * az > CORNER_END)
 
-    @staticmethod
-    def near(x: np.ndarray, z: np.ndarray, limits: np.ndarray) -> np.ndarray:
-        """Return which discs may be within the margin of a surface, bool as `x`, given their `limits`."""
-        x, z = np.abs(x), np.abs(z)
-        return (z > limits[0]) | (_C * x + _S * z > limits[1]) | (x > limits[2])
-
-    def contacts(self, x: np.ndarray, z: np.ndarray, radius: np.ndarray) -> Faced:
+    def contacts(self, x: np.ndarray, z: np.ndarray, gaps: Gaps) -> Faced:
         """Return the contacts of n discs with walls, nets and block: all gaps below 0.02 m."""
-        normal_x, normal_z, gap = self._features(x, z, radius)
-        feature, row = np.nonzero(gap < MARGIN)
-        return Faced(row, normal_x[feature, row], normal_z[feature, row], gap[feature, row])
+        close = gaps.gap < MARGIN
+        close[_CORNER] &= ~gaps.past_end
+        feature, disc = np.nonzero(close)
+        return self._faced(feature, disc, x, z, gaps.gap[feature, disc])
 
     def way(
-        self, x: np.ndarray, z: np.ndarray, to_x: np.ndarray, to_z: np.ndarray, radius: np.ndarray
-    ) -> tuple[np.ndarray, Faced]:
-        """Return the share of their straight ways that n discs can go [n], and the surfaces that end them.
+        self,
+        start: np.ndarray,
+        end: np.ndarray,
+        before: Gaps,
+        after: Gaps,
+        radius: np.ndarray,
+    ) -> tuple[Faced, np.ndarray]:
+        """Return what ends the straight ways of n discs from `start` to `end` [2, n], and at which share.
 
-        The gaps are those at the ways' ends: negative, as deep as the discs would be.
+        Each disc has at most one entry. The gaps are those at the ways' ends: negative, as deep as the
+        discs would be.
         """
-        normal_x, normal_z, gap = self._features(to_x, to_z, radius)
-        step_x, step_z = to_x - x, to_z - z
-        advance = normal_x * step_x + normal_z * step_z  # negative: towards the surface
-        hit = (gap < -_ROUNDING) & (advance < 0)
+        hit = after.gap < -_ROUNDING
+        hit[_CORNER] &= ~(before.past_end & after.past_end)
+        step_x, step_z = end - start
+        # a way that meets an edge is at least as long as the gaps before and after it
+        hit[_EDGE] |= before.gap[_EDGE] + after.gap[_EDGE] < np.sqrt(step_x * step_x + step_z * step_z)
+        if not hit.any():
+            return _NOTHING, _NOTHING.gap
+        edge = np.flatnonzero(hit[_EDGE])
         hit[_EDGE] = False
-        share = np.ones_like(gap)
-        np.divide(gap, advance, out=share, where=hit)
-        share[hit] = np.maximum(1.0 - share[hit], 0.0)
-        beyond = _S * np.abs(x + share[1] * step_x) - _C * np.abs(z + share[1] * step_z) > CORNER_END
-        share[1, beyond] = 1.0  # it passed the end of the corner wall
-        self._edge_ways((share, normal_x, normal_z, gap), (x, z), (step_x, step_z), radius)
-        first = share.argmin(axis=0)
-        nearest = share[first, np.arange(len(x))]
-        row = np.flatnonzero(nearest < 1)
-        first = first[row]
-        return nearest, Faced(row, normal_x[first, row], normal_z[first, row], gap[first, row])
+        feature, disc = np.nonzero(hit)
+        faced = self._faced(feature, disc, end[0], end[1], after.gap[feature, disc])
+        faced, share = _ends(faced, start, end)
+        if edge.size:
+            edges, until = self._edge_ways(edge, start, end, radius)
+            faced, share = _joined(faced, edges), np.concatenate([share, until])
+        order = np.lexsort((share, faced.disc))
+        order = order[np.diff(faced.disc[order], prepend=-1) > 0]  # the first that ends a way
+        return Faced(*(each[order] for each in faced)), share[order]
 
     def goals(self, x: np.ndarray, z: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return how often balls touch the blue goal's parts and the purple goal's, int64 [n] each.
@@ -112,61 +135,68 @@ class Pitch:
         blue = np.zeros_like(parts) if self.blue_closed else np.where(purple, 0, parts)
         return blue, np.where(purple, parts, 0)
 
-    def _features(
-        self, x: np.ndarray, z: np.ndarray, radius: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return unit normals x, z [5, n] and gaps [5, n], inf where a disc does not face the feature.
+    def _edge(self, purple: np.ndarray) -> tuple[np.ndarray, np.ndarray | float]:
+        """Return where the front edge of a mouth is, by end: of a net's side (post), or of the block."""
+        if not self.blue_closed:
+            return np.where(purple, POST_X[1], POST_X[0]), NET_Z
+        return np.where(purple, POST_X[1], BLOCK_X), np.where(purple, NET_Z, BLOCK_Z)
 
-        Features: long side, corner wall, the mouth's face, the mouth's front edge, the net's back.
-        """
-        ax, az = np.abs(x), np.abs(z)
-        end = (x > 0).astype(np.intp)
-        mouth_x = self._mouth_x[end]
-        normal_x, normal_z, gap = np.zeros((3, 5, len(x)))
-        normal_z[0] = -1
-        gap[0] = SIDE_Z - az
-        normal_x[1], normal_z[1] = -_C, -_S
-        gap[1] = np.where(_S * ax - _C * az > CORNER_END, np.inf, CORNER_OFFSET - _C * ax - _S * az)
-        along_x, along_z = ax - self._edge_x[end], az - self._edge_z[end]
-        facing = np.where(mouth_x > 0, along_z < 0, along_x > 0)
-        normal_x[2], normal_z[2] = -mouth_x, mouth_x - 1
-        gap[2] = np.where(facing, self._mouth_offset[end] - np.where(mouth_x > 0, ax, az), np.inf)
-        distance = np.sqrt(along_x * along_x + along_z * along_z) + 1e-12
-        normal_x[3], normal_z[3] = along_x / distance, along_z / distance
-        gap[3] = np.where(facing, np.inf, distance)
-        normal_x[4] = -1
-        gap[4] = np.where(az < GOAL_FLOOR_Z, self._back[end] - ax, np.inf)
-        gap -= radius
-        normal_x *= np.copysign(1.0, x)
-        normal_z *= np.copysign(1.0, z)
-        return normal_x, normal_z, gap
+    def _faced(
+        self, feature: np.ndarray, disc: np.ndarray, x: np.ndarray, z: np.ndarray, gap: np.ndarray
+    ) -> Faced:
+        """Return features with their normals, given their gaps [k] and the positions of all discs."""
+        x, z = x[disc], z[disc]
+        if self.blue_closed:
+            feature = np.where((feature == _MOUTH) & (x < 0), _BLOCK, feature)
+        normal_x, normal_z = _NORMAL_X[feature], _NORMAL_Z[feature]
+        edge = np.flatnonzero(feature == _EDGE)
+        if edge.size:
+            edge_x, edge_z = self._edge(x > 0)
+            away_x, away_z = (np.abs(x) - edge_x)[edge], (np.abs(z) - edge_z)[edge]
+            distance = np.sqrt(away_x * away_x + away_z * away_z) + 1e-12
+            normal_x[edge], normal_z[edge] = away_x / distance, away_z / distance
+        return Faced(disc, normal_x * np.copysign(1.0, x), normal_z * np.copysign(1.0, z), gap)
 
     def _edge_ways(
-        self,
-        entries: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-        start: tuple[np.ndarray, np.ndarray],
-        step: tuple[np.ndarray, np.ndarray],
-        radius: np.ndarray,
-    ) -> None:
-        """Enter hits of the mouth's front edges into shares, normals x, z and gaps, each [5, n].
+        self, disc: np.ndarray, start: np.ndarray, end: np.ndarray, radius: np.ndarray
+    ) -> tuple[Faced, np.ndarray]:
+        """Return edges that end the ways of some discs, and at which shares.
 
         |m + s d| = r with m from the edge to the start and d the way: s = (-b - sqrt(b^2 - a c)) / a.
         """
-        end = (start[0] > 0).astype(np.intp)
-        m_x = start[0] - np.copysign(self._edge_x[end], start[0])
-        m_z = start[1] - np.copysign(self._edge_z[end], start[1])
-        a = step[0] ** 2 + step[1] ** 2
-        b = m_x * step[0] + m_z * step[1]
+        (x, z), (to_x, to_z), radius = start[:, disc], end[:, disc], radius[disc]
+        edge_x, edge_z = self._edge(to_x > 0)
+        m_x, m_z = x - np.copysign(edge_x, to_x), z - np.copysign(edge_z, to_z)
+        d_x, d_z = to_x - x, to_z - z
+        a, b = d_x * d_x + d_z * d_z, m_x * d_x + m_z * d_z
         inside = b * b - a * (m_x * m_x + m_z * m_z - (radius - _ROUNDING) ** 2)
-        row = np.flatnonzero((b < 0) & (inside > 0))
-        if not row.size:
-            return
-        at = np.maximum((-b[row] - np.sqrt(inside[row])) / a[row], 0.0)
-        row, at = row[at < 1], at[at < 1]
-        away_x, away_z = m_x[row] + at * step[0][row], m_z[row] + at * step[1][row]
+        hit = np.flatnonzero((b < 0) & (inside > 0) & (-b - np.sqrt(np.maximum(inside, 0)) < a))
+        if not hit.size:
+            return _NOTHING, _NOTHING.gap
+        m_x, m_z, d_x, d_z = m_x[hit], m_z[hit], d_x[hit], d_z[hit]
+        share = np.maximum((-b[hit] - np.sqrt(inside[hit])) / a[hit], 0.0)
+        away_x, away_z = m_x + share * d_x, m_z + share * d_z
         distance = np.sqrt(away_x * away_x + away_z * away_z) + 1e-12
         away_x, away_z = away_x / distance, away_z / distance
-        to_x, to_z = m_x[row] + step[0][row], m_z[row] + step[1][row]
-        entered = (at, away_x, away_z, away_x * to_x + away_z * to_z - radius[row])
-        for entry, value in zip(entries, entered, strict=True):
-            entry[_EDGE, row] = value
+        gap = away_x * (m_x + d_x) + away_z * (m_z + d_z) - radius[hit]
+        return Faced(disc[hit], away_x, away_z, gap), share
+
+
+_NOTHING = Faced(np.zeros(0, np.int64), *np.zeros((3, 0)))
+
+
+def _ends(faces: Faced, start: np.ndarray, end: np.ndarray) -> tuple[Faced, np.ndarray]:
+    """Return those of some faces behind the ends of ways that the ways meet, and at which shares."""
+    disc, normal_x, normal_z, gap = faces
+    (x, z), (to_x, to_z) = start[:, disc], end[:, disc]
+    step_x, step_z = to_x - x, to_z - z
+    advance = normal_x * step_x + normal_z * step_z  # negative: towards the face
+    meets = advance < 0
+    share = np.clip(1.0 - gap / np.where(meets, advance, -1.0), 0.0, 1.0)
+    at_x, at_z = np.abs(x + share * step_x), np.abs(z + share * step_z)
+    meets &= (normal_x == 0) | (normal_z == 0) | (_S * at_x - _C * at_z <= CORNER_END)
+    return Faced(*(each[meets] for each in faces)), share[meets]
+
+
+def _joined(*parts: Faced) -> Faced:
+    return Faced(*(np.concatenate(each) for each in zip(*parts, strict=True)))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mappo_unity.scenes.rays import RaySensor, cast_faces, cast_spheres, touches_walls
+from mappo_unity.scenes.rays import Faces, RaySensor, cast_spheres
 from mappo_unity.scenes.soccer_physics import AGENT_RADIUS, BALL_RADIUS, SoccerPhysics
 from mappo_unity.scenes.soccer_pitch import (
     BACK_X,
@@ -72,11 +72,13 @@ class SoccerView:
         self._sensors = [view.sensors() for view in views]
         self._angles = [np.concatenate([eyes.angles for eyes in sensors]) for sensors in self._sensors]
         walls = list(_walls(physics.pitch.blue_closed))
-        self._begin, self._end = np.array([wall.begin for wall in walls]), np.array([w.end for w in walls])
+        self._walls = Faces(np.array([wall.begin for wall in walls]), np.array([wall.end for wall in walls]))
+        self._num_walls = len(walls)
         owned = [(edge, number) for number, wall in enumerate(walls) for edge in wall.edges]
         self._edges, self._owner = np.array([edge for edge, _ in owned]), np.array([n for _, n in owned])
         radius = np.array([BALL_RADIUS] + [AGENT_RADIUS] * len(agent_tags))
-        self._reach = np.sqrt((radius + CAST_RADIUS) ** 2 - CAST_HEIGHT**2)
+        self._reach = np.full(len(radius) + len(owned), CAST_RADIUS)  # bodies, edges
+        self._reach[: len(radius)] = np.sqrt((radius + CAST_RADIUS) ** 2 - CAST_HEIGHT**2)
         tags = ["ball", *agent_tags, *(walls[owner].tag for _, owner in owned), *(wall.tag for wall in walls)]
         self._tags = [
             np.array([view.tags.index(tag) if tag in view.tags else -1 for tag in tags]) for view in views
@@ -88,27 +90,36 @@ class SoccerView:
         position = self._physics.position
         heading = self._yaw[agent, field][:, None] + self._angles[behavior]
         direction = np.stack([np.sin(heading), np.cos(heading)], axis=-1)[:, :, None]
-        bodies = position[:, :, field].T[:, None]  # [n, 1, B, 2]
-        distance = self.cast(position[:, 1 + agent, field].T[:, None, None], direction, bodies)
+        distance = self._cast(position[:, 1 + agent, field].T, direction, position[:, :, field].T)
+        sensors = self._sensors[behavior]
+        encoded = sensors[0].encode(distance, self._tags[behavior]).reshape(len(slots), -1)
         frames, first = [], 0
-        for eyes in self._sensors[behavior]:
-            part = distance[:, first : first + eyes.num_rays]
-            frames.append(eyes.encode(part, self._tags[behavior]))
-            first += eyes.num_rays
+        for eyes in sensors:
+            frames.append(encoded[:, first : first + eyes.size])
+            first += eyes.size
         return frames
 
-    def cast(self, origin: np.ndarray, direction: np.ndarray, bodies: np.ndarray) -> np.ndarray:
+    def _cast(self, origin: np.ndarray, direction: np.ndarray, bodies: np.ndarray) -> np.ndarray:
         """Return distances in m, inf where nothing is met, [n, R, B + C + P]: bodies, edges, walls.
 
-        `origin` [n, 1, 1, 2]; unit `direction` [n, R, 1, 2]; `bodies` [n, 1, B, 2]. A wall that the caster
-        touches is not seen at all; its edges are edges of the same collider.
+        `origin` [n, 2]; unit `direction` [n, R, 1, 2]; `bodies` [n, B, 2]. A wall that the caster touches
+        is not seen at all; its edges are edges of the same collider.
         """
-        edges = cast_spheres(origin, direction, self._edges, CAST_RADIUS)
-        walls = cast_faces(origin, direction, CAST_RADIUS, self._begin, self._end, TOUCH)
-        touched = touches_walls(origin, CAST_RADIUS + TOUCH, self._begin, self._end)
-        if touched.any():
-            edges[np.broadcast_to(touched[:, :, self._owner], edges.shape)] = np.inf
-        return np.concatenate([cast_spheres(origin, direction, bodies, self._reach), edges, walls], axis=2)
+        num_bodies, num_discs = bodies.shape[1], len(self._reach)
+        discs = np.empty((len(origin), 1, num_discs, 2))
+        discs[:, 0, :num_bodies] = bodies
+        discs[:, 0, num_bodies:] = self._edges
+        distance = np.empty((*direction.shape[:2], num_discs + self._num_walls))
+        origin = origin[:, None, None]
+        distance[:, :, :num_discs] = cast_spheres(origin, direction, discs, self._reach)
+        distance[:, :, num_discs:] = self._walls.cast(origin, direction, CAST_RADIUS)
+        touched = self._walls.touches(origin, CAST_RADIUS + TOUCH)[:, 0]
+        row, wall = np.nonzero(touched)
+        if row.size:
+            distance[row, :, num_discs + wall] = np.inf
+            row, edge = np.nonzero(touched[:, self._owner])
+            distance[row, :, num_bodies + edge] = np.inf
+        return distance
 
 
 @dataclass(frozen=True)
