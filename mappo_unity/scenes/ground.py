@@ -35,12 +35,6 @@ PUSH_OUT = 0.8  # share of a penetration that PhysX removes in a tick
 MAX_PUSH_OUT = 10.0 * TICK_S  # m: at most 10 m/s; leaves no velocity behind
 
 
-def heading(yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the forward and right unit vectors ``[..., 3]`` of boxes with `yaw` ``[...]``."""
-    sin, cos, zero = np.sin(yaw), np.cos(yaw), np.zeros_like(yaw)
-    return np.stack([sin, zero, cos], -1), np.stack([cos, zero, -sin], -1)
-
-
 def slide(velocity: np.ndarray, impulse: np.ndarray | float, friction: float = BOX_FRICTION) -> None:
     """Reduce horizontal speed by at most `friction` * `impulse`, in place.
 

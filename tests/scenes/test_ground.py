@@ -33,12 +33,6 @@ def test_slide_stops_at_rest_and_leaves_the_air_alone() -> None:
     np.testing.assert_allclose(velocity, [[0, -1, 0], [3, -1, 4]])
 
 
-def test_heading_turns_clockwise_seen_from_above() -> None:
-    forward, right = ground.heading(_yaw(0, 90))
-    np.testing.assert_allclose(forward, [[0, 0, 1], [1, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(right, [[1, 0, 0], [0, 0, -1]], atol=1e-12)
-
-
 def test_plan_extent_of_a_turned_cube_is_its_half_diagonal() -> None:
     x, z = ground.plan_extent(_yaw(0, 45), CUBE)
     np.testing.assert_allclose(x, [0.5, 0.5**0.5])
@@ -69,9 +63,11 @@ def test_box_gap_is_the_same_in_a_turned_world() -> None:
     )
     expected, local_normal = ground.box_gap(local, yaw - other, half, other_half)
     np.testing.assert_allclose(gap, expected)
-    forward, right = ground.heading(other)
-    back = local_normal[:, :1] * right + local_normal[:, 1:2] * [0, 1, 0] + local_normal[:, 2:] * forward
+    x, y, z = local_normal.T  # right = (cos, 0, -sin), forward = (sin, 0, cos)
+    back = np.stack([x * np.cos(other) + z * np.sin(other), y, z * np.cos(other) - x * np.sin(other)], 1)
     np.testing.assert_allclose(normal, back, atol=1e-12)
+    overlap = ground.boxes_overlap(offset, yaw, half, other_half, other)
+    assert (overlap == (gap < 0)).all() and 0 < overlap.sum() < 50
     swapped, opposite = ground.box_gap(-offset, other, other_half, half, yaw)
     np.testing.assert_allclose(gap, swapped)
     np.testing.assert_allclose((normal * opposite).sum(1), -1)
