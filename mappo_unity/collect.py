@@ -17,8 +17,11 @@ def num_rounds(cfg: CollectConfig, agents: int) -> int:
     return cfg.rounds if cfg.batch_size is None else -(-cfg.batch_size // agents)
 
 
-def make_collector(env: EnvBase, policy: JointPolicy, rounds: int) -> Collector:
-    """Build a collector of endless batches of so many rounds."""
+def make_collector(env: EnvBase, policy: JointPolicy, rounds: int, device: str = "cpu") -> Collector:
+    """Build a collector of endless batches of so many rounds, on the networks' device."""
+    devices = (
+        {} if device == "cpu" else {"policy_device": device, "env_device": "cpu", "storing_device": device}
+    )
     return Collector(
         env,
         policy,
@@ -29,4 +32,5 @@ def make_collector(env: EnvBase, policy: JointPolicy, rounds: int) -> Collector:
         use_buffers=False,
         trust_policy=True,
         auto_register_policy_transforms=False,
+        **devices,
     )

@@ -69,11 +69,12 @@ class ActorPolicy:
         name = keys.policy_name(behavior)
         self.check(behavior, spec)
         places = team_places(steps.group_id, self.layout[name]["team_size"])
-        entries = {k: _spread(v, places) for k, v in _inputs(steps, spec).items()}
+        device = next(self.actors[name].parameters()).device
+        entries = {k: _spread(v, places).to(device) for k, v in _inputs(steps, spec).items()}
         kind = ExplorationType.DETERMINISTIC if self.deterministic else ExplorationType.RANDOM
         with set_exploration_type(kind):
             out = self.actors[name](TensorDict(entries, places.shape)).get(keys.ACTION)
-        chosen = out.numpy()[places.teams, places.members]
+        chosen = out.cpu().numpy()[places.teams, places.members]
         size, action = spec.action_spec.continuous_size, ActionTuple()
         if size:
             scaled = np.clip(chosen[:, :size], -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT

@@ -200,7 +200,7 @@ class PolicyLearner:
 
     def _end_values(self, following: TensorDictBase, truncated: Tensor) -> Tensor:
         """Values of terminal observations of cut episodes, 0 elsewhere."""
-        out = torch.zeros(truncated.shape)
+        out = torch.zeros(truncated.shape, device=truncated.device)
         where = truncated.flatten(0, -3).any(-2).squeeze(-1)
         if where.any():
             rows = following.select(*self.critic_keys).flatten(0, -2)[where]

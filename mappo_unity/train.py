@@ -186,7 +186,8 @@ class Trainer:
 
     def make_collector(self) -> Collector:
         """Build the collector; it goes on where the environment stands."""
-        return make_collector(transformed(self.env), self.policy, batch_rounds(self.cfg, self.env))
+        rounds = batch_rounds(self.cfg, self.env)
+        return make_collector(transformed(self.env), self.policy, rounds, self.cfg.device)
 
     def iterate(self, batches: Any) -> None:
         """Collect a batch, learn from it, log, and save when it is time."""

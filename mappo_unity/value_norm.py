@@ -39,8 +39,8 @@ class ValueNorm(nn.Module):
         if not self.enabled or not returns.numel():
             return
         returns = returns.double()
-        self.mean.mul_(self.beta).add_(returns.mean() * (1 - self.beta))
-        self.mean_sq.mul_(self.beta).add_((returns**2).mean() * (1 - self.beta))
+        self.mean.mul_(self.beta).add_(float(returns.mean()) * (1 - self.beta))
+        self.mean_sq.mul_(self.beta).add_(float((returns**2).mean()) * (1 - self.beta))
         self.debias.mul_(self.beta).add_(1 - self.beta)
 
     def statistics(self) -> tuple[float, float]:
