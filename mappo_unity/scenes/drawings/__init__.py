@@ -14,6 +14,13 @@ DRAWINGS = {
     "3DBall": "ball3d",
     "Basic": "basic",
     "GridFoodCollector": "grid_food_collector",
+    "Walker": "walker",
+    "Hallway": "hallway",
+    "WallJump": "wall_jump",
+    "Pyramids": "pyramids",
+    "DungeonEscape": "dungeon_escape",
+    "SoccerTwos": "soccer",
+    "StrikersVsGoalie": "soccer",
 }
 """Module of every scene's drawing, below this package; each holds `DRAWING`."""
 
