@@ -13,6 +13,7 @@ from tensordict import TensorDict
 
 from mappo_unity import checkpoint, export
 from mappo_unity.cli import eval_main, export_main
+from mappo_unity.compose import compose_config
 from mappo_unity.config import CollectConfig, Config, EnvConfig, LogConfig, ModelConfig, PPOConfig
 from mappo_unity.evaluate import evaluate
 from mappo_unity.export import RunExports, export_checkpoint, sample_inputs
@@ -267,8 +268,9 @@ def test_mappo_eval_plays_an_onnx_file_as_its_checkpoint(tiny_run, tmp_path, cap
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_run_policy_earns_what_mappo_eval_says(shared, tmp_path, deterministic):
     """A half-trained 3DBall policy (a perfect one hides differences), within two standard errors."""
-    cfg = Config(log=LogConfig(backends=[], progress=False), max_steps=45_000)
-    write_record(tmp_path, cfg, [])
+    lines = ["env=3DBall", "max_steps=40000", "log.backends=[]", "log.progress=false"]
+    cfg = compose_config(lines).config
+    write_record(tmp_path, cfg, lines)
     train(cfg, tmp_path)
     path = tmp_path / "checkpoints" / "final.onnx"
     found = evaluate(checkpoint.checkpoints_in(tmp_path)[-1], 240, deterministic, seed=1)
