@@ -1,0 +1,454 @@
+"""Players below the BaseEnv seam: connection, failures, restarts, several at once, registry, no orphans."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mappo_unity.backend import PLAYER_STRIDE, make_env_function
+from mappo_unity.config import Backend, ConfigError, EnvConfig, EnvironmentFailure
+from mappo_unity.link.restarts import SEED_STRIDE, RestartingPlayer
+from mappo_unity.link.server import Link
+from mappo_unity.link.several import SeveralPlayers
+from mappo_unity.player import main as player_main
+from mappo_unity.scenes import make_scene
+
+from mlagents_envs.base_env import ActionTuple, BaseEnv  # isort: skip  # mappo_unity lets it import
+
+BALL = "3DBall?team=0"
+BAD_PLAYER = Path(__file__).with_name("bad_player.py")
+
+
+@pytest.fixture(scope="module")
+def build(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A built 3DBall."""
+    folder = tmp_path_factory.mktemp("build")
+    player_main(["build", "3DBall", str(folder)])
+    return str(folder / "3DBall")
+
+
+@pytest.fixture
+def bad(tmp_path: Path) -> Callable[[str, int], str]:
+    """Return a function that builds a player which misbehaves after some messages."""
+
+    def build_bad(mode: str, after: int) -> str:
+        path = tmp_path / f"{mode}.x86_64"
+        command = shlex.join([sys.executable, str(BAD_PLAYER), mode, str(after)])
+        path.write_text(f'#!/bin/sh\nexec {command} "$@"\n')
+        path.chmod(0o755)
+        return str(path)
+
+    return build_bad
+
+
+def options(file_name: str, tmp_path: Path, **more: Any) -> EnvConfig:
+    defaults: dict[str, Any] = {"num_areas": 2, "timeout_s": 30.0, "player_logs": str(tmp_path / "logs")}
+    return EnvConfig(backend=Backend.player, file_name=file_name, **(defaults | more))
+
+
+def act_and_step(env: BaseEnv) -> None:
+    count = len(env.get_steps(BALL)[0])
+    env.set_actions(BALL, ActionTuple(np.zeros((count, 2), np.float32)))
+    env.step()
+
+
+def is_running(pid: int) -> bool:
+    """Tell whether a process runs; one that ended but was not waited for does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_until(holds: Callable[[], bool], seconds: float = 20.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if holds():
+            return True
+        time.sleep(0.05)
+    return False
+
+
+class TestPlayer:
+    """One player that works."""
+
+    def test_the_same_seed_gives_the_embedded_trajectory(self, build: str, tmp_path: Path) -> None:
+        player = make_env_function(options(build, tmp_path, params={"mass": 2.0}))(7)
+        scene = make_scene("3DBall", seed=7, num_areas=2, mass=2.0)
+        rng = np.random.default_rng(0)
+        try:
+            player.reset()
+            scene.reset()
+            assert dict(player.behavior_specs) == dict(scene.behavior_specs)
+            for step in range(120):
+                for mine, theirs in zip(player.get_steps(BALL), scene.get_steps(BALL), strict=True):
+                    for name in ("reward", "agent_id", "group_id"):
+                        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
+                    np.testing.assert_array_equal(mine.obs[0], theirs.obs[0])
+                action = rng.uniform(-1, 1, (len(scene.get_steps(BALL)[0]), 2)).astype(np.float32)
+                for env in (player, scene):
+                    env.set_actions(BALL, ActionTuple(action))
+                    env.reset() if step == 60 else env.step()
+        finally:
+            player.close()
+        assert "mass = 2" in (tmp_path / "logs" / "Player-0.log").read_text()
+
+    def test_only_the_loopback_address_is_listened_on(self) -> None:
+        link = Link()
+        try:
+            addresses = {
+                info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+            }
+            addresses |= {"127.0.0.2"}  # of this machine too, on Linux
+            with socket.create_connection(("127.0.0.1", link.port), timeout=5):
+                pass
+            for address in addresses - {"127.0.0.1"}:
+                with pytest.raises(OSError), socket.create_connection((address, link.port), timeout=5):
+                    pass
+            with pytest.raises(OSError), socket.create_connection(("::1", link.port), timeout=5):
+                pass
+        finally:
+            link.close()
+
+    def test_a_second_caller_is_turned_away(self) -> None:
+        import grpc
+
+        from mappo_unity.link.messages import METHOD
+
+        link = Link()
+        try:
+            with grpc.insecure_channel(f"127.0.0.1:{link.port}") as first:
+                pending = first.unary_unary(METHOD).future(b"hello")
+                assert link.receive(10) == b"hello"
+                local_pool = (("grpc.use_local_subchannel_pool", 1),)  # a connection of its own
+                with grpc.insecure_channel(f"127.0.0.1:{link.port}", local_pool) as second:
+                    with pytest.raises(grpc.RpcError, match="has a player already"):
+                        second.unary_unary(METHOD)(b"intruder", timeout=10)
+                link.reply(b"answer")
+                assert pending.result(10) == b"answer"
+        finally:
+            link.close()
+
+    def test_links_never_share_a_port(self) -> None:
+        links = [Link() for _ in range(20)]
+        try:
+            assert len({link.port for link in links}) == 20
+            with pytest.raises(ConfigError, match=f"port {links[0].port} of 127.0.0.1 is in use"):
+                Link(links[0].port)
+        finally:
+            for link in links:
+                link.close()
+
+    def test_closing_leaves_no_process(self, build: str, tmp_path: Path) -> None:
+        env = make_env_function(options(build, tmp_path))(0)
+        assert isinstance(env, RestartingPlayer) and env.player.process is not None
+        pid = env.player.process.pid
+        env.reset()
+        assert is_running(pid)
+        env.close()
+        env.close()
+        assert not is_running(pid)
+
+
+class TestFailures:
+    """Players that crash, hang, leave or send nonsense."""
+
+    @pytest.mark.parametrize(
+        ("mode", "words"),
+        [
+            ("crash", "killed by SIGKILL"),
+            ("exit", "exit code 7"),
+            ("hang", r"did not answer within env.timeout_s=2"),
+            ("close", "closed the connection: Academy was destroyed"),
+            ("malformed", "sent a malformed message of 4 bytes"),
+            ("nan", "agent 1: its sensor obs_0 holds nan"),
+        ],
+    )
+    def test_it_is_restarted_and_its_episodes_are_cut_off(
+        self, bad: Any, tmp_path: Path, caplog: Any, mode: str, words: str
+    ) -> None:
+        timeout = 2.0 if mode == "hang" else 30.0
+        env = make_env_function(options(bad(mode, 6), tmp_path, max_restarts=1, timeout_s=timeout))(3)
+        assert isinstance(env, RestartingPlayer)
+        with caplog.at_level(logging.WARNING):
+            env.reset()
+            first = env.get_steps(BALL)[0]
+            steps = 0
+            while not env.restarts:
+                before = env.get_steps(BALL)[0]
+                assert not env.cut_off
+                act_and_step(env)
+                steps += 1
+                assert steps < 30
+        decision, terminal = env.get_steps(BALL)
+        assert (
+            env.cut_off[BALL].tolist() == [0, 1] == terminal.agent_id.tolist() == decision.agent_id.tolist()
+        )
+        assert terminal.interrupted.all() and not terminal.reward.any()
+        np.testing.assert_array_equal(terminal.obs[0], before.obs[0])
+        fresh = make_scene("3DBall", seed=3 + SEED_STRIDE, num_areas=2)
+        fresh.reset()
+        np.testing.assert_array_equal(decision.obs[0], fresh.get_steps(BALL)[0].obs[0])
+        assert not np.array_equal(decision.obs[0], first.obs[0])
+        import re
+
+        assert re.search(words, caplog.text) and "restart 1 of at most 1" in caplog.text
+        assert str(tmp_path / "logs" / "Player-0.log") in caplog.text
+        act_and_step(env)
+        assert not env.cut_off and not len(env.get_steps(BALL)[1])
+        with pytest.raises(
+            EnvironmentFailure, match="restarted 1 times, and env.max_restarts=1 allows no more"
+        ):
+            for _ in range(30):
+                act_and_step(env)
+        env.close()
+
+    def test_a_stopped_process_is_ended_and_replaced(self, build: str, tmp_path: Path) -> None:
+        env = make_env_function(options(build, tmp_path, timeout_s=2.0, max_restarts=3))(0)
+        assert isinstance(env, RestartingPlayer)
+        env.reset()
+        for expected in (1, 2):
+            process = env.player.process
+            assert process is not None
+            os.kill(process.pid, signal.SIGSTOP)
+            act_and_step(env)
+            assert env.restarts == expected and not is_running(process.pid)
+        env.close()
+
+    def test_pauses_grow_with_failures_in_a_row(self) -> None:
+        from mappo_unity.link.restarts import _pause_s
+
+        assert [_pause_s(n) for n in range(5)] == [0, 0.5, 1, 2, 4]
+        assert _pause_s(50) == 30
+
+    @pytest.mark.parametrize(
+        ("mode", "after", "words"),
+        [
+            ("version", 0, "speaks version '2.0.0' of the ML-Agents protocol .package 9.9.9.*1.5.0"),
+            ("exit", 0, "ended while it started: exit code 7; its log: .*Player-0"),
+            ("hang", 0, "did not connect within env.timeout_s=3: it may need env.no_graphics=true"),
+            ("hang", 2, "did not answer within env.timeout_s=3: no agent asks.*DecisionRequester"),
+        ],
+    )
+    def test_a_player_that_never_worked_is_a_mistake_in_the_options(
+        self, bad: Any, tmp_path: Path, mode: str, after: int, words: str
+    ) -> None:
+        with pytest.raises(ConfigError, match=words):
+            make_env_function(options(bad(mode, after), tmp_path, timeout_s=3.0))(0).reset()
+
+    def test_behaviors_that_never_appear_are_missed(
+        self, bad: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        from mappo_unity import unity_env
+
+        monkeypatch.setattr(unity_env, "MAX_SILENT_STEPS", 50)
+        with pytest.raises(ConfigError, match="no behavior with an agent that asks"):
+            unity_env.UnityEnv(make_env_function(options(bad("silent", 2), tmp_path)))
+
+
+class TestEnds:
+    """However the trainer ends, the player does too."""
+
+    SCRIPT = """
+import sys, time
+from mappo_unity.backend import make_env_function
+from mappo_unity.config import Backend, EnvConfig
+env = make_env_function(EnvConfig(
+    backend=Backend.player, file_name=sys.argv[1], player_logs=sys.argv[2], timeout_s=60, num_players=2))(0)
+env.reset()
+print(*[p.player.process.pid for p in env.players], flush=True)
+if sys.argv[3] == "exit":
+    sys.exit(0)
+if sys.argv[3] == "raise":
+    raise RuntimeError("on purpose")
+while True:
+    env.step()
+"""
+
+    @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a stopped player lives on elsewhere")
+    @pytest.mark.parametrize("way", ["SIGKILL", "SIGTERM", "SIGINT", "exit", "raise", "stopped player"])
+    def test_no_player_is_left(self, build: str, tmp_path: Path, way: str) -> None:
+        trainer = subprocess.Popen(
+            [sys.executable, "-c", self.SCRIPT, build, str(tmp_path), way],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        assert trainer.stdout is not None
+        pids = [int(word) for word in trainer.stdout.readline().split()]
+        assert len(pids) == 2
+        if way == "stopped player":
+            os.kill(pids[0], signal.SIGSTOP)
+        if way not in ("exit", "raise"):
+            assert all(is_running(pid) for pid in pids)
+            trainer.send_signal(getattr(signal, way, signal.SIGKILL))
+        assert trainer.wait(30) != (0 if way != "exit" else 1)
+        assert wait_until(lambda: not any(is_running(pid) for pid in pids))
+
+
+class TestSeveral:
+    """Two players as one environment."""
+
+    def test_agents_of_both_stand_side_by_side(self, build: str, tmp_path: Path) -> None:
+        env = make_env_function(options(build, tmp_path, num_players=2))(5)
+        scenes = [make_scene("3DBall", seed=5 + n * PLAYER_STRIDE, num_areas=2) for n in range(2)]
+        rng = np.random.default_rng(0)
+        try:
+            env.reset()
+            for scene in scenes:
+                scene.reset()
+            for _ in range(60):
+                decision, terminal = env.get_steps(BALL)
+                parts = [scene.get_steps(BALL) for scene in scenes]
+                for mine, index in ((decision, 0), (terminal, 1)):
+                    theirs = [part[index] for part in parts]
+                    np.testing.assert_array_equal(mine.obs[0], np.concatenate([s.obs[0] for s in theirs]))
+                    ids = [2 * agent + n for n, s in enumerate(theirs) for agent in s.agent_id.tolist()]
+                    assert mine.agent_id.tolist() == ids
+                actions = [rng.uniform(-1, 1, (len(d), 2)).astype(np.float32) for d, _ in parts]
+                env.set_actions(BALL, ActionTuple(np.concatenate(actions)))
+                env.step()
+                for scene, action in zip(scenes, actions, strict=True):
+                    scene.set_actions(BALL, ActionTuple(action))
+                    scene.step()
+        finally:
+            env.close()
+        assert (tmp_path / "logs" / "Player-0.log").exists() and (tmp_path / "logs" / "Player-1.log").exists()
+
+    def test_one_that_dies_is_replaced_and_the_other_plays_on(self, build: str, tmp_path: Path) -> None:
+        env = make_env_function(options(build, tmp_path, num_players=2))(5)
+        assert isinstance(env, SeveralPlayers)
+        env.reset()
+        victim = env.players[1].player.process
+        assert victim is not None
+        os.kill(victim.pid, signal.SIGKILL)
+        act_and_step(env)
+        decision, terminal = env.get_steps(BALL)
+        assert env.restarts == 1 and env.cut_off[BALL].tolist() == [1, 3] == terminal.agent_id.tolist()
+        assert sorted(decision.agent_id.tolist()) == [0, 1, 2, 3]
+        env.close()
+
+    def test_groups_of_two_players_stay_apart(self) -> None:
+        env = SeveralPlayers([None, None])  # type: ignore[list-item]
+        ids = [env._groups(np.array([0, 1, 2]), player).tolist() for player in range(2)]
+        assert ids == [[0, 1, 3], [0, 2, 4]]
+
+
+class TestEditor:
+    """The Editor presses Play: here mappo-player does."""
+
+    def free_port(self) -> int:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            return int(probe.getsockname()[1])
+
+    def test_it_connects_and_says_what_it_waits_for(self, build: str, caplog: Any) -> None:
+        port = self.free_port()
+        play = subprocess.Popen([f"{build}.x86_64", "--mlagents-port", str(port)], stdout=subprocess.DEVNULL)
+        try:
+            with caplog.at_level(logging.WARNING):
+                env = make_env_function(EnvConfig(backend=Backend.editor, port=port, timeout_s=30))(0)
+            assert f"Unity Editor on port {port}: press Play" in caplog.text
+            env.reset()
+            assert len(env.get_steps(BALL)[0]) == 12
+            env.close()
+            assert play.wait(20) == 0
+        finally:
+            play.kill()
+
+    def test_an_editor_that_never_comes(self) -> None:
+        port = self.free_port()
+        with pytest.raises(
+            ConfigError, match=f"did not connect to port {port} within env.timeout_s=0.5: press"
+        ):
+            make_env_function(EnvConfig(backend=Backend.editor, port=port, timeout_s=0.5))(0)
+
+    def test_a_port_in_use(self) -> None:
+        with socket.socket() as holder:
+            holder.bind(("127.0.0.1", 0))
+            holder.listen()
+            port = holder.getsockname()[1]
+            with pytest.raises(ConfigError, match=f"port {port} of 127.0.0.1 is in use"):
+                make_env_function(EnvConfig(backend=Backend.editor, port=port, timeout_s=1))(0)
+
+
+class TestRegistry:
+    """A registry on this disk, with a player in a zip."""
+
+    @pytest.fixture
+    def registry(self, build: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "cache"))
+        (tmp_path / "cache").mkdir()
+        archive = tmp_path / "ball.zip"
+        with zipfile.ZipFile(archive, "w") as file:
+            file.write(f"{build}.x86_64", "Ball/Ball.x86_64")
+        path = tmp_path / "registry.yaml"
+        entry = "    expected_reward: 100\n    description: a ball\n    darwin_url: null\n    win_url: null\n"
+        path.write_text(
+            f"environments:\n- Ball:\n{entry}    linux_url: {archive.as_uri()}\n"
+            f"- Broken:\n{entry}    linux_url: {(tmp_path / 'absent.zip').as_uri()}\n"
+        )
+        return path
+
+    def test_an_entry_is_fetched_and_played(self, registry: Path, capfd: Any) -> None:
+        cfg = EnvConfig(name="Ball", backend=Backend.registry, registry=str(registry), num_areas=2)
+        env = make_env_function(cfg)(0)
+        env.reset()
+        assert len(env.get_steps(BALL)[0]) == 2
+        env.close()
+        assert not capfd.readouterr().out
+
+    def test_entries_that_do_not_exist_or_give_nothing(self, registry: Path, tmp_path: Path) -> None:
+        cfg = {"backend": Backend.registry, "registry": str(registry)}
+        with pytest.raises(ConfigError, match="has no entry 'Bal'; choices: Ball, Broken"):
+            make_env_function(EnvConfig(registry_entry="Bal", **cfg))  # type: ignore[arg-type]
+        with pytest.raises(ConfigError, match="entry 'Broken'.*absent.zip gives no player"):
+            make_env_function(EnvConfig(registry_entry="Broken", **cfg))  # type: ignore[arg-type]
+        with pytest.raises(ConfigError, match="cannot be read"):
+            make_env_function(EnvConfig(backend=Backend.registry, registry=str(tmp_path / "no.yaml")))
+
+
+class TestOptions:
+    """Mistakes that are seen before anything starts."""
+
+    def test_files_that_are_no_players(self, build: str, tmp_path: Path) -> None:
+        with pytest.raises(
+            ConfigError, match="no Unity player is there; looked for .*Gaem with .x86_64.*3DBall"
+        ):
+            make_env_function(options(str(Path(build).with_name("Gaem")), tmp_path))
+        plain = tmp_path / "Game.x86_64"
+        plain.write_text("")
+        with pytest.raises(ConfigError, match="is not executable; run: chmod"):
+            make_env_function(options(str(plain), tmp_path))
+
+    @pytest.mark.parametrize(
+        ("fields", "words"),
+        [
+            ({"backend": Backend.player}, "env.file_name is not given, but env.backend=player needs it"),
+            ({"num_players": 2}, "env.num_players=2 needs env.backend=player"),
+            ({"num_players": 0}, "env.num_players=0 is out of range"),
+            ({"timeout_s": 0.0}, "env.timeout_s=0.0 is out of range"),
+            ({"port": 70000}, "env.port=70000 is out of range"),
+            ({"screen_width": 80}, "env.screen_width and env.screen_height belong together"),
+            (
+                {"backend": Backend.editor, "params": {"mass": "big"}},
+                "env.params.mass='big' must be a number",
+            ),
+        ],
+    )
+    def test_options_that_cannot_be(self, fields: dict[str, Any], words: str) -> None:
+        with pytest.raises(ConfigError, match=words):
+            EnvConfig(**fields)
