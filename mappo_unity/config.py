@@ -414,7 +414,7 @@ class EvalConfig:
     episodes: int = 100
     """Agent episodes to play; matches, when there is an opponent."""
     opponent: Optional[str] = None
-    """Play matches, both sides in turn, against random, or another run folder or checkpoint."""
+    """Play matches, both sides in turn, against random, or another run folder, checkpoint or ONNX file."""
     deterministic: bool = False
     """Take the most likely action instead of a sampled one."""
     seed: int = 0
