@@ -7,6 +7,7 @@ ended by SIGINT and SIGTERM.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -51,16 +52,19 @@ def _run_command(
     name: str, command: Callable[[list[str]], int], help_text: Callable[[], str], arguments: list[str] | None
 ) -> int:
     lines = sys.argv[1:] if arguments is None else arguments
-    if any(line in ("--help", "-h") for line in lines):
-        print(help_text())
-        return 0
-    if "--version" in lines:
-        from mappo_unity import __version__
-
-        print(f"{name} {__version__}")
-        return 0
     try:
+        if any(line in ("--help", "-h") for line in lines):
+            print(help_text(), flush=True)
+            return 0
+        if "--version" in lines:
+            from mappo_unity import __version__
+
+            print(f"{name} {__version__}")
+            return 0
         return command(lines)
+    except BrokenPipeError:  # the reader of our output has gone, as in `mappo-eval ... | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except ConfigError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2

@@ -33,9 +33,10 @@ def group_choices() -> dict[str, list[str]]:
 
 
 def all_groups() -> list[str]:
-    """Return every group under conf/, Hydra's own too: env first, Hydra's last."""
+    """Return every group under conf/ that a person chooses from, Hydra's own too: env first, Hydra's last."""
     conf = conf_dir()
     groups = {path.parent.relative_to(conf).as_posix() for path in conf.rglob("*.yaml")} - {"."}
+    groups = {group for group in groups if not group.startswith("official")}  # a recipe chooses there
     return sorted(groups, key=lambda group: (group.startswith("hydra"), group != "env", group))
 
 

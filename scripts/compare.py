@@ -1,0 +1,101 @@
+#!/usr/bin/env python3
+"""Train variants of one environment under the same budget, one after the other, and print a table.
+
+    python scripts/compare.py env=3DBall --steps 500000 -- default recipe=mlagents recipe=benchmarl
+    python scripts/compare.py env=SoccerTwos --seconds 300 --matches 200 -- default model.critic=local
+
+A variant is a list of overrides joined by '+' ("default" is none). Where an environment has two sides,
+the end of a run plays matches against a random side.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import statistics
+import tempfile
+from pathlib import Path
+
+from mappo_unity.backend import make_env_function
+from mappo_unity.compose import compose_config
+from mappo_unity.evaluate import match_figures
+from mappo_unity.fit import describe_policies
+from mappo_unity.matches import play_matches
+from mappo_unity.policies import ActorPolicy, RandomPolicy
+from mappo_unity.train import Trainer
+
+QUIET = ["log.progress=false", "log.backends=[]", "export_onnx=false", "checkpoint_interval=1000000000"]
+
+
+def main() -> None:
+    """Run all variants and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("env", help="env=NAME and further overrides joined by '+'")
+    parser.add_argument("--seconds", type=float, default=None, help="wall-clock budget of a variant")
+    parser.add_argument("--steps", type=int, default=None, help="agent decisions of a variant")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--goal", type=float, default=95.0, help="mean return whose first time is printed")
+    parser.add_argument("--matches", type=int, default=0, help="matches against a random side at the end")
+    parser.add_argument("variants", nargs="+")
+    arguments = parser.parse_args()
+    print(f"load average at the start: {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores")
+    columns = "variant", "seed", "agent steps", "s", "steps/s", "mean return", "first at goal"
+    print(f"| {' | '.join([*columns, 'explained variance', 'matches'])} |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for variant in arguments.variants:
+        for seed in arguments.seeds:
+            print(run(arguments, variant, seed), flush=True)
+    print(f"load average at the end: {os.getloadavg()[0]:.2f}")
+
+
+def run(arguments: argparse.Namespace, variant: str, seed: int) -> str:
+    """Train one variant; return its row of the table."""
+    lines = [*arguments.env.split("+"), *([] if variant == "default" else variant.split("+"))]
+    lines += [f"seed={seed}", *QUIET] + ([f"max_steps={arguments.steps}"] if arguments.steps else [])
+    cfg = compose_config(lines).config
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = BudgetTrainer(cfg, Path(folder))
+        trainer.seconds = arguments.seconds
+        outcome = trainer.run()
+        matches = play(trainer, arguments.matches) if arguments.matches else "-"
+        trainer.close()
+        with open(Path(folder) / "metrics.csv", newline="") as file:
+            rows = list(csv.DictReader(file))
+    reached = next((row for row in rows if float(row["return_mean"]) >= arguments.goal), None)
+    first = f"{int(reached['agent_steps']):,} ({float(reached['wall_s']):.0f} s)" if reached else "-"
+    variances = [float(row["explained_variance"]) for row in rows[len(rows) // 2 :]]
+    return (
+        f"| {variant} | {seed} | {outcome.agent_steps:,} | {outcome.wall_s:.0f} | "
+        f"{outcome.agent_steps / outcome.wall_s:,.0f} | {outcome.return_mean:.2f} | {first} | "
+        f"{statistics.median(variances):.3f} | {matches} |"
+    )
+
+
+class BudgetTrainer(Trainer):
+    """A trainer that also ends when its wall-clock budget is over."""
+
+    seconds: float | None = None
+
+    def _status(self) -> str | None:
+        if self.seconds is not None and self.wall_s >= self.seconds:
+            return "finished"
+        return super()._status()
+
+
+def play(trainer: Trainer, count: int) -> str:
+    """Play matches of the trained policy against a random side."""
+    actors = {name: learner.actor for name, learner in trainer.learners.items()}
+    player = ActorPolicy(describe_policies(trainer.env), actors, False, "the policy")
+    scores = play_matches(make_env_function(trainer.cfg.env), player, RandomPolicy(1), count, seed=1)
+    figures = match_figures(scores)
+    return (
+        f"{100 * figures['won_of_decided']:.1f} % of {figures['wins'] + figures['losses']} decided, "
+        f"{figures['draws']} draws"
+    )
+
+
+if __name__ == "__main__":
+    main()
