@@ -1,0 +1,134 @@
+"""mappo-doctor finds what is wrong and names the cure."""
+
+from __future__ import annotations
+
+import shlex
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mappo_unity.cli import doctor_main
+from mappo_unity.doctor import CURES, diagnose, port_state
+from mappo_unity.player import main as player_main
+
+BAD_PLAYER = Path(__file__).with_name("bad_player.py")
+
+
+def examine(*arguments: str) -> tuple[int, str]:
+    lines: list[str] = []
+    code = diagnose([*arguments, "--seconds", "0.05"], lines.append)
+    return code, "\n".join(lines)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def bad_player(tmp_path: Path, mode: str, after: int) -> str:
+    path = tmp_path / "Bad.x86_64"
+    path.write_text(
+        f'#!/bin/sh\nexec {shlex.join([sys.executable, str(BAD_PLAYER), mode, str(after)])} "$@"\n'
+    )
+    path.chmod(0o755)
+    return str(path)
+
+
+def test_a_sound_player_is_described(tmp_path: Path) -> None:
+    player_main(["build", "3DBall", str(tmp_path), "--num-areas", "3"])
+    code, text = examine("--file-name", str(tmp_path / "3DBall"), "--no-graphics")
+    assert code == 0 and "FAIL" not in text
+    for words in (
+        "protobuf is compiled (upb)",
+        "3DBall, package",
+        "protocol 1.5.0",
+        "all 7 capabilities",
+        "behavior 3DBall?team=0: 2 continuous actions",
+        "obs_0 (8,) VectorSensor_size8",
+        "3 agents ask: 0 teams, 3 agents alone",
+        "decisions a step",
+        "contract checker",
+        "time scale 1:",
+        "time scale 100:",
+    ):
+        assert words in text, words
+
+
+@pytest.mark.parametrize(
+    ("mode", "after", "words"),
+    [
+        ("silent", 2, CURES["no behavior"]),
+        ("exit", 0, "exit code 7; its log"),
+        ("version", 0, "speaks version '2.0.0'"),
+        ("hang", 2, "DecisionRequester"),
+    ],
+)
+def test_a_sick_player_is_told_its_cure(tmp_path: Path, mode: str, after: int, words: str) -> None:
+    code, text = examine("--file-name", bad_player(tmp_path, mode, after), "--timeout-s", "3")
+    assert code == 1 and "FAIL" in text and words in text
+
+
+def test_files_that_are_no_players(tmp_path: Path) -> None:
+    code, text = examine("--file-name", str(tmp_path / "Nothing"))
+    assert code == 1 and "no Unity player is there" in text
+    (tmp_path / "Game.x86_64").write_text("")
+    code, text = examine("--file-name", str(tmp_path / "Game"))
+    assert code == 1 and "chmod +x" in text
+
+
+def test_the_editor_presses_play(tmp_path: Path) -> None:
+    player_main(["build", "3DBall", str(tmp_path), "--num-areas", "2"])
+    port = free_port()
+    play = subprocess.Popen(
+        [tmp_path / "3DBall.x86_64", "--mlagents-port", str(port)], stdout=subprocess.DEVNULL
+    )
+    try:
+        code, text = examine("--editor", "--port", str(port), "--timeout-s", "20")
+        assert code == 0 and "2 agents ask" in text
+        assert play.wait(20) == 0
+    finally:
+        play.kill()
+
+
+def test_an_editor_that_never_plays() -> None:
+    code, text = examine("--editor", "--port", str(free_port()), "--timeout-s", "0.3")
+    assert code == 1 and "press Play" in text
+
+
+def test_ports_in_use_are_told_from_ports_that_linger() -> None:
+    with socket.socket() as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as gRPC's servers do
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        port = server.getsockname()[1]
+        assert port_state(port) == "in use"
+        client = socket.create_connection(("127.0.0.1", port))
+        accepted, _ = server.accept()
+    accepted.close()  # the side that closes first is the one in TIME_WAIT
+    client.close()
+    assert port_state(port) == "TIME_WAIT"
+    assert port_state(free_port()) == "free"
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        _, text = examine("--port", str(server.getsockname()[1]))
+        assert CURES["in use"] in text
+
+
+def test_slow_protobuf_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("google.protobuf.internal.api_implementation.Type", lambda: "python")
+    code, text = examine()
+    assert code == 1 and CURES["protobuf"] in text
+
+
+def test_mistakes_in_the_options(capsys: Any) -> None:
+    assert doctor_main(["--fil-name", "Game"]) == 2
+    assert doctor_main(["--file-name", "Game", "--editor"]) == 2
+    assert "not allowed with" in capsys.readouterr().err
+    assert doctor_main(["--help"]) == 0
+    assert "--timeout-s" in capsys.readouterr().out

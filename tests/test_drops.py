@@ -1,0 +1,160 @@
+"""Episodes that a failed player cut off: they leave the batch and the statistics, and training goes on."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from fakes import Record, ScriptedEnv
+
+from mappo_unity import checkpoint
+from mappo_unity.cli import train_main
+from mappo_unity.collect import make_collector
+from mappo_unity.config import EnvironmentFailure
+from mappo_unity.drops import drop_episodes, episode_rows
+from mappo_unity.scenes import make_scene
+from mappo_unity.unity_env import UnityEnv
+
+FAKE = "Fake?team=0"
+
+
+class Fragile(ScriptedEnv):
+    """A scripted environment whose result number `breaks_at` is that of a restarted player."""
+
+    breaks_at = 0
+    cut: tuple[int, ...] = ()
+
+    @property
+    def restarts(self) -> int:
+        return int(self.at >= self.breaks_at)
+
+    @property
+    def cut_off(self) -> dict[str, np.ndarray]:
+        return {FAKE: np.array(self.cut, np.int32)} if self.at == self.breaks_at else {}
+
+
+def fragile(script: list[list[Record]], breaks_at: int, cut: tuple[int, ...]) -> UnityEnv:
+    env = Fragile(script)
+    env.breaks_at, env.cut = breaks_at, cut
+    return UnityEnv(lambda seed: env)
+
+
+def idle(env: UnityEnv, rounds: int) -> Any:
+    """Collect a batch with random actions."""
+    return env.rollout(rounds, break_when_any_done=False)
+
+
+def test_rows_of_an_episode_reach_back_to_the_one_before() -> None:
+    done = torch.tensor([[0, 0], [1, 0], [0, 0], [0, 0], [1, 1], [0, 0]], dtype=torch.bool)
+    rows = episode_rows(done, 4, torch.tensor([True, False]))
+    assert rows[:, 0].tolist() == [False, False, True, True, True, False] and not rows[:, 1].any()
+    assert episode_rows(done, 4, torch.tensor([True, True]))[:, 1].tolist() == [True] * 5 + [False]
+
+
+def test_a_cut_episode_neither_counts_nor_is_learned_from() -> None:
+    # Agent 0 ends by itself in result 1; the player fails in result 3 and takes both agents' episodes along.
+    script = [
+        [Record(0), Record(1)],
+        [Record(0, ends="terminated", reward=5), Record(0), Record(1, reward=1)],
+        [Record(0, reward=1), Record(1, reward=1)],
+        [Record(0, ends="interrupted"), Record(1, ends="interrupted"), Record(0), Record(1)],
+        [Record(0, reward=2), Record(1, reward=2)],
+        [Record(0, ends="terminated", reward=3), Record(0), Record(1, reward=2)],
+    ]
+    env = fragile(script, 3, (0, 1))
+    batch = idle(env, 5)
+    cuts = env.pop_cut_off()
+    assert [(c.round, c.behavior, c.slots.ravel().tolist()) for c in cuts] == [(2, FAKE, [True, True])]
+    assert not env.pop_cut_off()
+    assert env.restarts == 1
+    finished = env.pop_episodes()[FAKE]
+    assert [(e.individual_return, e.length) for e in finished] == [(5, 1), (5, 2)]
+    truncated = batch["next", "Fake", "truncated"].reshape(5, 2)
+    assert truncated.tolist() == [[False] * 2] * 2 + [[True, True]] + [[False] * 2] * 2
+    # row t holds the decisions of result t: agent 0's cut episode is rows 1 and 2, agent 1's rows 0 to 2
+    assert drop_episodes(batch, cuts, env) == 2 + 3
+    assert batch["Fake", "acting"].reshape(5, 2).T.tolist() == [
+        [True, False, False, True, True],
+        [False, False, False, True, True],
+    ]
+
+
+def test_an_environment_without_players_has_no_restarts() -> None:
+    assert UnityEnv(lambda seed: ScriptedEnv([[Record(0)]])).restarts is None
+
+
+def test_drops_reach_batches_of_the_collector() -> None:
+    """The collector's batch is changed in place, whatever way it is stored."""
+    from mappo_unity.transforms import transformed
+
+    env = fragile([[Record(0, reward=1), Record(1, reward=1)]] * 12, 99, ())
+    collector = make_collector(transformed(env), None, 5)  # type: ignore[arg-type]
+    batches = iter(collector)
+    next(batches)
+    base: Any = env.base_env
+    base.breaks_at, base.cut = 8, (1,)
+    base.script[8] = [Record(1, ends="interrupted"), Record(0), Record(1)]
+    batch = next(batches)
+    dropped = drop_episodes(batch, env.pop_cut_off(), env)
+    assert dropped == 3  # results 5, 6 and 7 are rows 0 to 2 of the second batch
+    assert batch["Fake", "acting"].reshape(5, 2).T.tolist() == [[True] * 5, [False] * 3 + [True] * 2]
+    collector.shutdown()
+
+
+def failing_factory(seed: int, steps: int) -> Any:
+    """Return 3DBall that is restarted once, and fails for good after `steps` steps."""
+    scene = make_scene("3DBall", seed=seed, num_areas=6)
+    step = scene.step
+    count = 0
+
+    def counted() -> None:
+        nonlocal count
+        count += 1
+        if count > steps:
+            raise EnvironmentFailure("player Game failed: killed by SIGKILL; its log: Player-0.log")
+        scene.restarts = int(count > 30)
+        step()
+
+    scene.step = counted
+    scene.restarts, scene.cut_off = 0, {}
+    return scene
+
+
+def test_past_the_limit_there_is_a_checkpoint_and_exit_code_3(tmp_path: Path, capsys: Any) -> None:
+    code = train_main(
+        [
+            "env=custom",
+            "env.factory=test_drops:failing_factory",
+            "env.params.steps=100",
+            "collect.rounds=20",
+            "ppo.minibatch_size=60",
+            "model.hidden=[16]",
+            "log.backends=[csv]",
+            "log.progress=false",
+            "export_onnx=false",
+            f"output_dir={tmp_path}",
+            f"hydra.run.dir={tmp_path}/run",
+        ]
+    )
+    assert code == 3
+    captured = capsys.readouterr()
+    assert "mappo-train: player Game failed: killed by SIGKILL; its log: Player-0.log" in captured.err
+    assert "Traceback" not in captured.err
+    path, warnings = checkpoint.newest_good(tmp_path / "run")
+    with open(tmp_path / "run" / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert checkpoint.load(path)["agent_steps"] == int(rows[-1]["agent_steps"]) > 0 and not warnings
+    assert [float(row["restarts"]) for row in rows[:1]] == [0] and float(rows[-1]["restarts"]) == 1
+
+
+def test_runs_without_players_have_no_such_columns(tmp_path: Path) -> None:
+    from test_train import options
+
+    from mappo_unity.train import Trainer
+
+    trainer = Trainer(options(1), tmp_path)
+    assert trainer._drop_cut_off(next(iter(trainer.make_collector()))) == {}
+    trainer.close()
