@@ -152,8 +152,12 @@ class UnityEnv(EnvBase):
         self.base_env = self._make_env(int(seed))
         self._behaviors: dict[str, BehaviorRounds] = {}
         self._cut_off = []
-        self.base_env.reset()
-        self._first_results()
+        try:
+            self.base_env.reset()
+            self._first_results()
+        except BaseException:
+            self.base_env.close()
+            raise
         self._untouched = True
 
     def _full_reset(self) -> None:
