@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import shlex
 import signal
 import socket
@@ -110,7 +111,7 @@ class TestPlayer:
         link = Link()
         try:
             addresses = {
-                info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+                str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
             }
             addresses |= {"127.0.0.2"}  # of this machine too, on Linux
             with socket.create_connection(("127.0.0.1", link.port), timeout=5):
@@ -203,8 +204,6 @@ class TestFailures:
         fresh.reset()
         np.testing.assert_array_equal(decision.obs[0], fresh.get_steps(BALL)[0].obs[0])
         assert not np.array_equal(decision.obs[0], first.obs[0])
-        import re
-
         assert re.search(words, caplog.text) and "restart 1 of at most 1" in caplog.text
         assert str(tmp_path / "logs" / "Player-0.log") in caplog.text
         act_and_step(env)
@@ -220,12 +219,11 @@ class TestFailures:
         env = make_env_function(options(build, tmp_path, timeout_s=2.0, max_restarts=3))(0)
         assert isinstance(env, RestartingPlayer)
         env.reset()
-        for expected in (1, 2):
-            process = env.player.process
-            assert process is not None
-            os.kill(process.pid, signal.SIGSTOP)
-            act_and_step(env)
-            assert env.restarts == expected and not is_running(process.pid)
+        process = env.player.process
+        assert process is not None
+        os.kill(process.pid, signal.SIGSTOP)
+        act_and_step(env)
+        assert env.restarts == 1 and not is_running(process.pid)
         env.close()
 
     def test_pauses_grow_with_failures_in_a_row(self) -> None:

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes import vector_spec
 
 from mappo_unity.config import ConfigError
 from mappo_unity.link import decode, encode, messages
 from mappo_unity.link.rows import varint_columns
 from mappo_unity.player import env_function, main
 from mappo_unity.scenes import make_scene, scene_names
-from tests.fakes import vector_spec
 
 from mlagents_envs.base_env import (  # isort: skip  # mappo_unity lets it import
     ActionSpec,
