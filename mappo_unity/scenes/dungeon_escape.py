@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.scenes.base import Scene
-from mappo_unity.scenes.dungeon_room import DRAGON, KEY, LOCK, NUM_AGENTS, PORTAL, DungeonRoom
+from mappo_unity.scenes.dungeon_layout import DRAGON, KEY, LOCK, NUM_AGENTS, PORTAL
+from mappo_unity.scenes.dungeon_room import DungeonRoom
 from mappo_unity.scenes.dungeon_sight import EYES, see
 from mappo_unity.scenes.specs import Behavior, Parameter, Sensor
 
@@ -103,20 +104,22 @@ class DungeonEscape(Scene):
 
     def simulate(self) -> None:
         """Move all bodies by one tick, then let touches act: key, dragon, lock, portal."""
-        touching = self.room.step(self.enabled)
+        touching = self.room.step()
         escaped = self.room.dragon_escapes()
-        entered = touching[:, :, LOCK] & ~self.at_lock
-        self.at_lock = touching[:, :, LOCK]
-        if not (entered.any() or escaped.any() or touching[:, :, PORTAL:].any()):
+        at_lock = touching[:, :, LOCK]
+        entered = at_lock & ~self.at_lock
+        self.at_lock = at_lock
+        if not (touching[:, :, PORTAL : KEY + 1].any() or entered.any() or escaped.any()):
             return
         taken = _first(touching[:, :, KEY])
         self.has_key |= taken
-        self.room.key_present &= ~taken.any(axis=1)
+        self.room.present[:, KEY] &= ~taken.any(axis=1)
         self._kill(_first(touching[:, :, DRAGON]))
         self._unlock(np.any(entered & self.has_key, axis=1))
         self._enter_portal(touching[:, :, PORTAL])
-        escaped &= self.room.dragon_present & (self.timer > 0)
+        escaped &= self.room.present[:, DRAGON] & (self.timer > 0)
         self._end_groups(np.flatnonzero(escaped))
+        self.room.refresh(self.enabled)
 
     def parameter_changed(self, name: str) -> None:
         """Apply gravity at once."""
@@ -131,6 +134,7 @@ class DungeonEscape(Scene):
         """Restore `scene_state`."""
         self.room.gravity = self.parameters["gravity"]
         self.room.set_state(state["room"])
+        self.room.refresh(self.enabled)
         for name in ("has_key", "at_lock", "remaining", "timer"):
             getattr(self, name)[...] = state[name]
 
@@ -138,7 +142,7 @@ class DungeonEscape(Scene):
         """Let the dragon and the agents that touched it vanish; bool [N, A], at most one an area."""
         areas, agents = np.nonzero(victim)
         if areas.size:
-            self.room.dragon_present[areas] = False
+            self.room.present[areas, DRAGON] = False
             self.remaining[areas] -= 1
             self.disable(self.slots[areas, agents])
             self.room.bury(areas, agents)
@@ -177,6 +181,7 @@ class DungeonEscape(Scene):
         self.room.reset(areas, self.rng, self.enabled, DRAGON_SPEED)
         slots = self.slots[areas].ravel()
         self.enable(slots, self._groups[slots])
+        self.room.refresh(self.enabled)
 
 
 def _first(mask: np.ndarray) -> np.ndarray:

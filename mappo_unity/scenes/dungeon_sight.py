@@ -11,52 +11,50 @@ from __future__ import annotations
 
 import numpy as np
 
-from mappo_unity.scenes.dungeon_room import (
+from mappo_unity.scenes.dungeon_layout import (
     AGENT_HALF,
-    DRAGON_HALF,
+    CARRIED_KEY,
+    COLUMN,
+    COLUMN_BASE_HALF,
+    COLUMN_RADIUS,
+    DRAGON,
     HALVES,
+    KEY,
+    KEY_HALF,
     LOCK,
     NUM_AGENTS,
     PORTAL,
-    PORTAL_YAW,
-    WALL,
-    DungeonRoom,
-)
-from mappo_unity.scenes.dungeon_spawn import (
-    CARRIED_KEY_HALF,
-    COLUMN,
-    COLUMN_RADIUS,
+    TOMB,
     TOMB_DROP,
     TOMB_LOWER_HALF,
     TOMB_UPPER_HALF,
+    WALL,
 )
+from mappo_unity.scenes.dungeon_room import DungeonRoom
 from mappo_unity.scenes.ground import CONTACT_GAP
 from mappo_unity.scenes.rays import RaySensor, cast_rectangles, cast_spheres, flat_radius, passes
 
 WALL_TAG, AGENT_TAG, DRAGON_TAG, KEY_TAG, LOCK_TAG, PORTAL_TAG = range(6)
 EYES = RaySensor(tags=6, rays_per_side=7, max_degrees=60, length=40)
-CARRIED_KEY = (0.94, -0.37)  # m ahead of the dragon's centre and above it
 
 _COLUMNS = np.array([[x, z] for x in (COLUMN[0], -COLUMN[0]) for z in (COLUMN[1], -COLUMN[1])])
-# Boxes along the axes (lock, the columns' bases): centre, half extents. Then boxes with a yaw.
-_STILL = np.array([[0.015, 1.385, 12.6, *HALVES[LOCK]], *([x, 0, z, 0.85, 0.185, 0.85] for x, z in _COLUMNS)])
-_TURNED_HALVES = np.array(
+_BASES = np.insert(_COLUMNS, 1, 0.0, axis=1)
+_THINGS = [LOCK, PORTAL, DRAGON, KEY, TOMB]
+_NUM_BASES, _NUM_BOXES = len(_BASES), len(_BASES) + len(_THINGS) + 2 + NUM_AGENTS
+_HALVES = np.array(
     [
-        HALVES[PORTAL],
-        *[AGENT_HALF] * NUM_AGENTS,
-        DRAGON_HALF,
-        CARRIED_KEY_HALF,
-        CARRIED_KEY_HALF,
+        *[COLUMN_BASE_HALF] * _NUM_BASES,
+        *HALVES[[LOCK, PORTAL, DRAGON, KEY]],
         TOMB_UPPER_HALF,
         TOMB_LOWER_HALF,
+        KEY_HALF,
+        *[AGENT_HALF] * NUM_AGENTS,
     ]
 )
-_HALVES = np.concatenate([_STILL[:, 3:], _TURNED_HALVES])
-_NUM_STILL, _NUM_BOXES = len(_STILL), len(_HALVES)
 _TAGS = np.array(
-    [LOCK_TAG]
-    + [WALL_TAG] * len(_COLUMNS)
-    + [PORTAL_TAG, *[AGENT_TAG] * NUM_AGENTS, DRAGON_TAG, KEY_TAG, KEY_TAG, WALL_TAG, WALL_TAG]
+    [WALL_TAG] * _NUM_BASES
+    + [LOCK_TAG, PORTAL_TAG, DRAGON_TAG, KEY_TAG, WALL_TAG, WALL_TAG, KEY_TAG]
+    + [AGENT_TAG] * NUM_AGENTS
     + [WALL_TAG] * len(_COLUMNS)
     + [WALL_TAG] * 2
 )  # boxes, columns, the walls across and along
@@ -102,27 +100,22 @@ def _boxes(
     room: DungeonRoom, slots: np.ndarray, enabled: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return centres [n, M, 3], yaws and presence [n, M] of the boxes of `_HALVES`."""
-    first, areas = _NUM_STILL, slots // NUM_AGENTS
-    centre = np.empty((len(slots), _NUM_BOXES, 3))
-    yaw = np.zeros(centre.shape[:2])
-    present = np.ones(centre.shape[:2], bool)
-    ahead = np.stack([np.sin(room.dragon_yaw), np.zeros(len(enabled)), np.cos(room.dragon_yaw)], axis=1)
-    carried = room.dragon_position + CARRIED_KEY[0] * ahead + (0.0, CARRIED_KEY[1], 0.0)
-    lower = room.tomb_position - (0.0, TOMB_DROP, 0.0)
-    centre[:, :first] = _STILL[:, :3]
-    centre[:, first], yaw[:, first] = (11.83, 1.83, -11.77), PORTAL_YAW
-    agents = slice(first + 1, first + 1 + NUM_AGENTS)
-    centre[:, agents] = room.position.reshape(-1, NUM_AGENTS, 3)[areas]
-    yaw[:, agents] = room.yaw.reshape(-1, NUM_AGENTS)[areas]
-    present[:, agents] = enabled[areas]
-    present[np.arange(len(slots)), agents.start + slots % NUM_AGENTS] = False  # the eyes are inside it
-    bodies = (
-        (room.dragon_position, room.dragon_yaw, room.dragon_present),
-        (carried, room.dragon_yaw, room.dragon_present),
-        (room.key_position, room.key_yaw, room.key_present),
-        (room.tomb_position, room.tomb_yaw, room.tomb_present),
-        (lower, room.tomb_yaw, room.tomb_present),
+    shape = (len(enabled), _NUM_BOXES - NUM_AGENTS)  # first what all agents of an area see, [N, M - A]
+    things = slice(_NUM_BASES, _NUM_BASES + len(_THINGS))
+    centre, yaw, present = np.empty((*shape, 3)), np.zeros(shape), np.ones(shape, bool)
+    centre[:, :_NUM_BASES] = _BASES
+    centre[:, things], yaw[:, things] = room.thing[:, _THINGS], room.thing_yaw[:, _THINGS]
+    present[:, things] = room.present[:, _THINGS]
+    dragon_yaw = room.thing_yaw[:, DRAGON]
+    centre[:, -2:] = room.thing[:, [TOMB, DRAGON]]  # the tombstone's lower box, the dragon's key
+    centre[:, -2:, 1] += (-TOMB_DROP, CARRIED_KEY[1])
+    centre[:, -1, 0] += CARRIED_KEY[0] * np.sin(dragon_yaw)
+    centre[:, -1, 2] += CARRIED_KEY[0] * np.cos(dragon_yaw)
+    yaw[:, -2:], present[:, -2:] = room.thing_yaw[:, [TOMB, DRAGON]], room.present[:, [TOMB, DRAGON]]
+    areas = slots // NUM_AGENTS
+    others = np.arange(NUM_AGENTS) != (slots % NUM_AGENTS)[:, None]  # one's own eyes are inside one's body
+    return (
+        np.concatenate([centre, room.position.reshape(-1, NUM_AGENTS, 3)], axis=1)[areas],
+        np.concatenate([yaw, room.yaw.reshape(-1, NUM_AGENTS)], axis=1)[areas],
+        np.concatenate([present[areas], enabled[areas] & others], axis=1),
     )
-    for number, (place, turn, there) in enumerate(bodies, start=agents.stop):
-        centre[:, number], yaw[:, number], present[:, number] = place[areas], turn[areas], there[areas]
-    return centre, yaw, present

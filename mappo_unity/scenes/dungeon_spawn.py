@@ -5,70 +5,45 @@ In: the bodies of an area. Out: new poses. Knows no rules.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from mappo_unity.scenes.dungeon_layout import (
+    AGENT_HALF,
+    COLUMN,
+    COLUMN_RADIUS,
+    DRAGON,
+    HALVES,
+    KEY_HALF,
+    NUM_AGENTS,
+    TOMB_LOWER_HALF,
+    TOMB_UPPER_HALF,
+)
 from mappo_unity.scenes.ground import box_gap
-
-if TYPE_CHECKING:
-    from mappo_unity.scenes.dungeon_room import DungeonRoom
 
 RANGE = 6.25  # m: x and z of a spot, half the floor's half-width
 SPAWN_Y = 1.0
 QUERY_HALF = (2.5, 0.01, 2.5)  # m: an axis-aligned box around the spot that nothing may overlap
-COLUMN = np.array([4.5, 4.0])  # x, z of one of the four columns
-COLUMN_RADIUS = 0.718
-CARRIED_KEY_HALF = (0.605, 0.23, 0.09)  # the free key's, too
-TOMB_DROP = 0.85  # of the tombstone's lower box below the upper one
-TOMB_UPPER_HALF = (0.525, 0.71, 0.165)
-TOMB_LOWER_HALF = (0.605, 0.22, 0.26)
 BODY_HALVES = np.array(
-    [
-        [0.5, 0.5, 0.5],
-        [0.5, 0.5, 0.5],
-        [0.5, 0.5, 0.5],
-        [0.75, 0.75, 0.75],
-        CARRIED_KEY_HALF,
-        TOMB_LOWER_HALF,
-        TOMB_UPPER_HALF,
-    ]
-)  # three agents, dragon, free key, the tombstone's lower and upper box
+    [*[AGENT_HALF] * NUM_AGENTS, HALVES[DRAGON], KEY_HALF, TOMB_UPPER_HALF, TOMB_LOWER_HALF]
+)
 TRIES = 16  # drawn at once
 
 
-def spawn_agents(room: DungeonRoom, areas: np.ndarray, rng: np.random.Generator, enabled: np.ndarray) -> None:
-    """Place the agents of `areas` [n] one after the other, at rest, with a random heading.
+def draw_poses(
+    rng: np.random.Generator, centre: np.ndarray, yaw: np.ndarray, present: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions [n, A, 3] and yaws [n, A] for the agents of n areas, drawn one agent after the other.
 
-    Bodies in the way, as in Unity: columns; agents, those not yet moved where they were (one's own body,
-    too); the dragon, key and tombstone of the ended episode. `enabled` bool [N, A].
+    Bodies in the way, as in Unity: columns, and `centre` [n, 7, 3], `yaw`, `present` [n, 7] of the bodies in
+    the order of `BODY_HALVES`: agents, those not yet moved where they were (one's own body, too); the
+    dragon, key and tombstone of the ended episode.
     """
-    num_agents = enabled.shape[1]
-    centre, yaw, present = _bodies(room, areas, enabled)
-    for number in range(num_agents):
-        slots = areas * num_agents + number
-        spot = _free_spots(rng, centre, yaw, present)
-        room.position[slots] = centre[:, number] = spot
-        room.yaw[slots] = yaw[:, number] = rng.uniform(0.0, 2 * np.pi, len(areas))
-        room.velocity[slots] = 0.0
+    centre, yaw, present = centre.copy(), yaw.copy(), present.copy()
+    for number in range(NUM_AGENTS):
+        centre[:, number] = _free_spots(rng, centre, yaw, present)
+        yaw[:, number] = rng.uniform(0.0, 2 * np.pi, len(yaw))
         present[:, number] = True
-
-
-def _bodies(
-    room: DungeonRoom, areas: np.ndarray, enabled: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return centres [n, 7, 3], yaws [n, 7] and presence [n, 7] in the order of `BODY_HALVES`."""
-    tomb = room.tomb_position[areas]
-    num_areas, num_agents = enabled.shape
-    agents = room.position.reshape(num_areas, num_agents, 3)[areas]
-    others = (room.dragon_position[areas], room.key_position[areas], tomb - [0.0, TOMB_DROP, 0.0], tomb)
-    centre = np.concatenate([agents, np.stack(others, axis=1)], axis=1)
-    tomb_yaw = room.tomb_yaw[areas]
-    turns = (room.dragon_yaw[areas], room.key_yaw[areas], tomb_yaw, tomb_yaw)
-    yaw = np.concatenate([room.yaw.reshape(num_areas, num_agents)[areas], np.stack(turns, axis=1)], axis=1)
-    there = (room.dragon_present, room.key_present, room.tomb_present, room.tomb_present)
-    present = np.concatenate([enabled[areas], np.stack(there, axis=1)[areas]], axis=1)
-    return centre, yaw, present
+    return centre[:, :NUM_AGENTS], yaw[:, :NUM_AGENTS]
 
 
 def _free_spots(
