@@ -37,6 +37,7 @@ class Window:
             raise ConfigError("there is no display for a window here; video=FILE.mp4 or .gif writes a film")
         import glfw
 
+        glfw.ERROR_REPORTING = "ignore"  # no warnings beside our message
         self._glfw: Any = glfw
         self._window: Any = None
         if glfw.init():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ from mappo_unity.scenes.drawings.shapes import (
     yaw_rotation,
 )
 from mappo_unity.video import VideoFile, check_video
+from mappo_unity.window import Window
 
 SIZE = (160, 96)
 CAMERA = Camera((0.0, 0.0, 0.0), 12.0, yaw=0.0, pitch=30.0)
@@ -188,6 +191,14 @@ def test_a_folder_of_onnx_files_plays_every_behavior(shared: Path) -> None:
     cfg = PlayConfig(env="Basic", policy=str(shared / "oracle" / "3DBall.onnx"))
     with pytest.raises(ConfigError, match=r"3DBall.onnx cannot play 'Basic\?team=0'"):
         policies_of(cfg, open_scene(cfg))
+
+
+@pytest.mark.skipif("DISPLAY" not in os.environ, reason="needs a display (xvfb-run pytest ...)")
+def test_a_window_shows_frames_at_their_time() -> None:
+    start = time.monotonic()
+    with Window(CAMERA, SIZE, fps=20, title="test") as window:
+        assert all(window.show([ball((0, 0, 0), 1.0, RED)], CAMERA) for _ in range(10))
+    assert time.monotonic() - start > 0.4
 
 
 @pytest.mark.parametrize(
