@@ -1,0 +1,45 @@
+"""The package's import graph has no cycle, and light modules stay light."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import mappo_unity
+
+PACKAGE = Path(mappo_unity.__file__).parent
+
+
+def module_name(path):
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports_of(path, known):
+    """Modules of the package that a file imports, inside functions too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            node.body = []
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return found & known - {"mappo_unity"}
+
+
+def test_modules_import_only_upward():
+    paths = {module_name(path): path for path in PACKAGE.rglob("*.py")}
+    graph = {name: imports_of(path, set(paths)) - {name} for name, path in paths.items()}
+    assert "mappo_unity.ppo" in graph["mappo_unity.build"]
+    left = dict(graph)
+    while left:
+        free = [name for name, needs in left.items() if not needs & left.keys()]
+        assert free, f"modules that import each other: {sorted(left)}"
+        for name in free:
+            del left[name]
+
+
+def test_options_and_help_need_no_torch():
+    code = "import sys, mappo_unity.config, mappo_unity.compose, mappo_unity.cli; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
