@@ -20,11 +20,8 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
     Raises:
         ConfigError: no such scene, a folder that cannot be written, or a platform without scripts.
     """
-    from mappo_unity.player import env_function
-
     if rest:
         raise ConfigError(f"mappo-player build: unknown arguments {' '.join(rest)}")
-    env_function(scene)
     name = scene.rpartition(":")[2] or scene
     path = _executable(Path(folder), name)
     command = [sys.executable, "-m", "mappo_unity.player", scene]
