@@ -27,29 +27,31 @@ from mappo_unity.scenes.drawings.shapes import (
     yaw_rotation,
 )
 from mappo_unity.scenes.dungeon_escape import DungeonEscape
-from mappo_unity.scenes.dungeon_room import (
+from mappo_unity.scenes.dungeon_layout import (
     AGENT_HALF,
-    DRAGON_HALF,
+    COLUMN,
+    COLUMN_BASE_HALF,
+    COLUMN_RADIUS,
+    DRAGON,
     HALVES,
+    KEY,
+    KEY_HALF,
     LOCK,
+    LOCK_CENTRE,
     NUM_AGENTS,
     PORTAL,
+    PORTAL_CENTRE,
     PORTAL_YAW,
-)
-from mappo_unity.scenes.dungeon_room import (
-    WALL as WALL_FACE,
-)
-from mappo_unity.scenes.dungeon_spawn import (
-    CARRIED_KEY_HALF,
-    COLUMN,
-    COLUMN_RADIUS,
+    TOMB,
     TOMB_DROP,
     TOMB_LOWER_HALF,
     TOMB_UPPER_HALF,
 )
+from mappo_unity.scenes.dungeon_layout import (
+    WALL as WALL_FACE,
+)
 
 WALL_SHOWN = 1.2  # m: cut off, to look inside
-DOOR, CAVE = (0.015, 1.385, 12.6), (11.83, 1.83, -11.77)  # middles of the lock and of the portal
 
 
 def shapes(scene: DungeonEscape, area: int) -> list[Shape]:
@@ -63,17 +65,17 @@ def shapes(scene: DungeonEscape, area: int) -> list[Shape]:
             drawn += agent_cube(place, AGENT_HALF[0], yaw, BLUE)
             if scene.has_key[area, agent]:
                 drawn += _key(place + [0, 0.85, 0], yaw)
-    if room.dragon_present[area]:
-        yaw = float(room.dragon_yaw[area])
-        place, turn = room.dragon_position[area], yaw_rotation(yaw)
-        drawn += agent_cube(place, DRAGON_HALF[0], yaw, RED)
+    present, things = room.present[area], room.thing[area]
+    yaws = room.thing_yaw[area].tolist()
+    if present[DRAGON]:
+        drawn += agent_cube(things[DRAGON], HALVES[DRAGON, 0], yaws[DRAGON], RED)
         for side in (-1, 1):
-            horn = place + turn @ np.array([0.45 * side, 0.95, 0.3])
+            horn = things[DRAGON] + yaw_rotation(yaws[DRAGON]) @ np.array([0.45 * side, 0.95, 0.3])
             drawn.append(capsule(horn, 0.12, 0.22, DARK))
-    if room.key_present[area]:
-        drawn += _key(room.key_position[area], float(room.key_yaw[area]))
-    if room.tomb_present[area]:
-        place, turn = room.tomb_position[area], yaw_rotation(float(room.tomb_yaw[area]))
+    if present[KEY]:
+        drawn += _key(things[KEY], yaws[KEY])
+    if present[TOMB]:
+        place, turn = things[TOMB], yaw_rotation(yaws[TOMB])
         drawn.append(box(place, TOMB_UPPER_HALF, GREY, turn))
         drawn.append(box(place - [0, TOMB_DROP, 0], TOMB_LOWER_HALF, GREY, turn))
     return drawn
@@ -85,16 +87,17 @@ def _room() -> list[Shape]:
     for x in (-COLUMN[0], COLUMN[0]):
         for z in (-COLUMN[1], COLUMN[1]):
             drawn.append(cylinder((x, 1.75, z), COLUMN_RADIUS, 1.75, GREY))
-            drawn += [box((x, y, z), (0.85, 0.185, 0.85), GREY) for y in (0.0, 3.5)]
-    drawn.append(box(DOOR, HALVES[LOCK], BROWN))
-    drawn.append(box((DOOR[0], DOOR[1], DOOR[2] - HALVES[LOCK][2]), (1.1, 1.05, 0.06), GREEN))
+            drawn += [box((x, y, z), COLUMN_BASE_HALF, GREY) for y in (0.0, 3.5)]
+    drawn.append(box(LOCK_CENTRE, HALVES[LOCK], BROWN))
+    front = np.array(LOCK_CENTRE) - [0, 0, HALVES[LOCK, 2]]
+    drawn.append(box(front, (1.1, 1.05, 0.06), GREEN))
     turn = yaw_rotation(PORTAL_YAW)
-    drawn.append(box(CAVE, HALVES[PORTAL], faded(PURPLE, 0.6), turn))
+    drawn.append(box(PORTAL_CENTRE, HALVES[PORTAL], faded(PURPLE, 0.6), turn))
     return drawn
 
 
 def _key(place: np.ndarray, yaw: float) -> list[Shape]:
-    turn, half = yaw_rotation(yaw), np.array(CARRIED_KEY_HALF)
+    turn, half = yaw_rotation(yaw), np.array(KEY_HALF)
     bow = place + turn @ np.array([-half[0] + half[1], 0, 0])
     teeth = place + turn @ np.array([half[0] - 0.12, -0.12, 0])
     lying = turn @ np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # its own y points ahead
