@@ -70,6 +70,7 @@ class FoodPhysics:
         self.agent_velocity, self.ball_velocity = self._views(self._velocity)
         _, self.ball_spin = self._views(self._spin)
         self._agent_pairs = np.triu_indices(num_agents, 1)
+        self._compare_in_circle()
 
     def step(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Advance by one tick; `drive` [3, N, A]: velocity changes of the agents, m/s.
@@ -85,6 +86,16 @@ class FoodPhysics:
         self._separate(contacts, floor_gap)
         area, agent = np.divmod(touches.other, self._shape[1])
         return area, agent, touches.one % self._shape[1] - self._num_agents
+
+    def _compare_in_circle(self) -> None:
+        """Lay out the comparison of each ball with the next half of its area's balls, in a circle."""
+        num, half = self._num_balls, self._num_balls // 2
+        self._circle = np.zeros((2, self._shape[0], num + half), np.float32)  # x, z; the first half again
+        windows = np.lib.stride_tricks.sliding_window_view(self._circle[:, :, 1:], num, axis=2)
+        self._ahead_in_circle = windows  # [2, N, steps ahead - 1, ball]: a view of `_circle`
+        steps, ball = np.divmod(np.arange(half * num), num)
+        self._ball_pairs = np.stack([ball, (ball + steps + 1) % num], axis=1)
+        self._pair_counts = (steps + 1 < num - half) | (ball < half)  # of an even number half meets twice
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return copies of all poses, velocities and sizes."""
@@ -138,26 +149,22 @@ class FoodPhysics:
         )
 
     def _ball_contacts(self) -> Contacts:
-        """Find balls at balls; each is compared with the next half of its area's balls, in a circle."""
-        num, half = self._num_balls, self._num_balls // 2
-        close = np.float32((2 * BALL_RADIUS + CONTACT_GAP) ** 2)
-        x, z = (
-            np.concatenate([part, part[:, :half]], axis=1)
-            for part in self.ball_position[::2].astype(np.float32)
-        )
-        x = np.lib.stride_tricks.sliding_window_view(x[:, 1:], num, axis=1) - x[:, None, :num]
-        z = np.lib.stride_tricks.sliding_window_view(z[:, 1:], num, axis=1) - z[:, None, :num]
-        x *= x
-        z *= z
-        x += z
-        area, ahead, ball = np.nonzero(x < close * np.float32(1.001))
-        keep = (ahead + 1 < num - half) | (ball < half)  # with an even number the last half meets twice
-        area, ball, ahead = area[keep], ball[keep], ahead[keep]
+        """Find balls at balls."""
+        num, circle = self._num_balls, self._circle
+        circle[:, :, :num] = self.ball_position[::2]
+        circle[:, :, num:] = circle[:, :, : num // 2]
+        square = self._ahead_in_circle - circle[:, :, None, :num]
+        square *= square
+        square[0] += square[1]
+        near = np.flatnonzero(square[0] < _NEAR_BALLS)
+        if not near.size:
+            return _NONE
+        area, pair = np.divmod(near, len(self._ball_pairs))
         first = area * self._shape[1] + self._num_agents
-        one, other = first + ball, first + (ball + ahead + 1) % num
+        one, other = first + self._ball_pairs[pair].T
         offset = self._position[:, one] - self._position[:, other]
         distance = np.sqrt((offset * offset).sum(axis=0))
-        touch = distance < 2 * BALL_RADIUS + CONTACT_GAP
+        touch = (distance < 2 * BALL_RADIUS + CONTACT_GAP) & self._pair_counts[pair]
         distance = distance[touch]
         return Contacts(
             one[touch],
@@ -225,7 +232,7 @@ class FoodPhysics:
             mobility = self._inverse_mass * share
             mass = 1.0 / (mobility[one] + mobility[other])
             closing = np.maximum(gap, 0.0) / TICK_S  # the gap may be closed within the tick
-            both = np.concatenate([one, other])
+            cells = self._cells(one, other)
             push = np.concatenate(
                 [normal * self._inverse_mass[one], normal * -self._inverse_mass[other]], axis=1
             )
@@ -237,14 +244,14 @@ class FoodPhysics:
                 if np.abs(change).max() < NEGLIGIBLE:
                     break
                 impulse = grown
-                _add(velocity, both, push * np.concatenate([change, change]))
+                _add(velocity, cells, push * np.concatenate([change, change]))
                 more = np.maximum(slowest - vertical, 0.0)
                 vertical += more
                 lift += more
-            self._rub(contacts, friction * impulse, share)
+            self._rub(contacts, cells, friction * impulse, share)
         self._rub_floor(lift.reshape(self._shape))
 
-    def _rub(self, contacts: Contacts, limit: np.ndarray, share: np.ndarray) -> None:
+    def _rub(self, contacts: Contacts, cells: np.ndarray, limit: np.ndarray, share: np.ndarray) -> None:
         """Brake the slip at contacts by at most `limit` [C], kg m/s; balls are spun by it."""
         one, other, normal, _, _ = contacts
         slip = self._velocity[:, one] - self._velocity[:, other]
@@ -256,9 +263,9 @@ class FoodPhysics:
         impulse = np.minimum(speed / (mobility[one] + mobility[other]), limit)
         torque = _cross(normal, slip) * (BALL_RADIUS * impulse)
         slip *= impulse
-        both, mass, inertia = np.concatenate([one, other]), self._inverse_mass, self._inverse_inertia
-        _add(self._velocity, both, np.concatenate([slip * -mass[one], slip * mass[other]], axis=1))
-        _add(self._spin, both, np.concatenate([torque * inertia[one], torque * inertia[other]], axis=1))
+        mass, inertia = self._inverse_mass, self._inverse_inertia
+        _add(self._velocity, cells, np.concatenate([slip * -mass[one], slip * mass[other]], axis=1))
+        _add(self._spin, cells, np.concatenate([torque * inertia[one], torque * inertia[other]], axis=1))
 
     def _rub_floor(self, lift: np.ndarray) -> None:
         """Brake bodies on the floor; `lift` [N, A + F]: vertical impulse by mass, m/s.
@@ -291,8 +298,13 @@ class FoodPhysics:
             mobility_one, mobility_other = self._inverse_mass[one], self._inverse_mass[other]
             push = contacts.normal[:, deep] * (push_out(contacts.gap[deep]) / (mobility_one + mobility_other))
             apart = np.concatenate([push * mobility_one, push * -mobility_other], axis=1)
-            _add(self._position, np.concatenate([one, other]), apart)
+            _add(self._position, self._cells(one, other), apart)
         self._position[1, :-1] += push_out(floor_gap)
+
+    def _cells(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Return the places of both bodies' x, y, z in flattened [3, B + 1], int [3 * 2 C]."""
+        both = np.concatenate([one, other])
+        return (_ROWS * (self._num_bodies + 1) + both).reshape(-1)
 
     def _views(self, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the agents' and the balls' part of an array [3, B + 1], as views."""
@@ -301,14 +313,15 @@ class FoodPhysics:
         return by_area[:, :, : self._num_agents], by_area[:, :, self._num_agents :]
 
 
+_ROWS = np.arange(3)[:, None]
+_NEAR_BALLS = np.float32(1.001 * (2 * BALL_RADIUS + CONTACT_GAP) ** 2)  # m^2, in single precision
 _NONE = Contacts(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((3, 0)), np.zeros(0), np.zeros(0))
 _STATE = ("_position", "_velocity", "_spin", "_reach", "agent_yaw")
 
 
-def _add(bodies: np.ndarray, index: np.ndarray, values: np.ndarray) -> None:
-    """Add `values` [3, C] to the columns `index` of `bodies`; a column may occur several times."""
-    cells = np.arange(3)[:, None] * bodies.shape[1] + index
-    np.add.at(bodies.reshape(-1), cells.reshape(-1), values.reshape(-1))
+def _add(bodies: np.ndarray, cells: np.ndarray, values: np.ndarray) -> None:
+    """Add `values` [3, 2 C] to `cells` of `bodies` [3, B + 1]; a cell may occur several times."""
+    np.add.at(bodies.reshape(-1), cells, values.reshape(-1))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
