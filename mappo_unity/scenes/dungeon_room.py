@@ -199,6 +199,7 @@ class DungeonRoom:
         gap = self.position[:, 1] - STANDING
         falling = bool(gap.any())
         if not falling:
+            velocity[:, 1] = 0.0
             velocity *= DRAG_KEPT
             slide(velocity, pull * DRAG_KEPT)
             return False
