@@ -6,17 +6,16 @@ MuJoCo three to five times as much, and the doubled friction of boxes needs expl
 (`ground.py`).
 
 A tick follows Unity's engine: free motion; contacts of the poses at the start (gaps below 0.02 m count);
-inelastic impulses in `ITERATIONS` rounds, friction after them; motion; penetrations shrink without leaving a
+inelastic impulses, friction after them (`food_solver.py`); motion; penetrations shrink without leaving a
 velocity behind. Legend: N areas, A agents, F balls of an area, B = N * (A + F) bodies, C contacts. Vectors
 are component first, Unity's axes (x right, y up, z forward), metres from the middle of the area's floor.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
+from mappo_unity.scenes.food_solver import NONE, Contacts, Solver, joined
 from mappo_unity.scenes.ground import BOX_FRICTION, CONTACT_GAP, POINT_FRICTION, TICK_S, box_gap, push_out
 
 GRAVITY = 9.81  # m/s^2
@@ -27,23 +26,6 @@ BALL_MASS, BALL_RADIUS = 5.0, 0.75  # kg, m; no drag
 SPIN_KEPT = 1.0 - 0.05 * TICK_S  # angular drag 0.05/s
 MAX_SPIN = 7.0  # rad/s: the engine's limit for bodies that set none
 BALL_INERTIA = 0.4 * BALL_MASS * BALL_RADIUS**2  # solid sphere
-ITERATIONS = 6
-NEGLIGIBLE = 1e-6  # kg m/s: an impulse that ends the rounds
-
-
-class Contacts(NamedTuple):
-    """Contacts between bodies, or between a body and a wall."""
-
-    one: np.ndarray
-    """int [C]: body."""
-    other: np.ndarray
-    """int [C]: body, or B for a wall."""
-    normal: np.ndarray
-    """[3, C]: unit vector from the other to the one."""
-    gap: np.ndarray
-    """[C], m: negative where they overlap."""
-    friction: np.ndarray
-    """[C]."""
 
 
 class FoodPhysics:
@@ -60,8 +42,11 @@ class FoodPhysics:
         self._num_bodies = num_areas * (num_agents + num_balls)
         self._position, self._velocity, self._spin = np.zeros((3, 3, self._num_bodies + 1))  # last: walls
         agent = np.tile(np.arange(num_agents + num_balls) < num_agents, num_areas)
-        self._inverse_mass = np.append(np.where(agent, 1 / AGENT_MASS, 1 / BALL_MASS), 0.0)
-        self._inverse_inertia = np.append(np.where(agent, 0.0, 1 / BALL_INERTIA), 0.0)
+        self._solver = Solver(
+            np.append(np.where(agent, 1 / AGENT_MASS, 1 / BALL_MASS), 0.0),
+            np.append(np.where(agent, 0.0, 1 / BALL_INERTIA), 0.0),
+            BALL_RADIUS,
+        )
         self._reach = np.full(self._shape, BALL_RADIUS)  # from the centre down to the lowest point
         self.agent_half = self._reach[:, :num_agents]
         self.agent_half[...] = AGENT_HALF
@@ -79,23 +64,17 @@ class FoodPhysics:
         """
         self._move_freely(drive)
         touches = self._agent_ball_contacts()
-        contacts = _joined([touches, self._ball_contacts(), self._agent_contacts(), self._wall_contacts()])
+        contacts = joined([touches, self._ball_contacts(), self._agent_contacts(), self._wall_contacts()])
         floor_gap = self._position[1, :-1] - self._reach.reshape(-1)
-        self._solve(contacts, floor_gap)
+        near_floor = floor_gap < CONTACT_GAP
+        slowest = np.where(near_floor, np.maximum(floor_gap, 0.0) / -TICK_S, -np.inf)
+        lift = self._solver.solve(contacts, self._velocity, self._spin, slowest)
+        self._rub_floor(lift.reshape(self._shape))
         self._position += self._velocity * TICK_S
-        self._separate(contacts, floor_gap)
+        self._solver.separate(contacts, self._position)
+        self._position[1, :-1] += push_out(floor_gap)
         area, agent = np.divmod(touches.other, self._shape[1])
         return area, agent, touches.one % self._shape[1] - self._num_agents
-
-    def _compare_in_circle(self) -> None:
-        """Lay out the comparison of each ball with the next half of its area's balls, in a circle."""
-        num, half = self._num_balls, self._num_balls // 2
-        self._circle = np.zeros((2, self._shape[0], num + half), np.float32)  # x, z; the first half again
-        windows = np.lib.stride_tricks.sliding_window_view(self._circle[:, :, 1:], num, axis=2)
-        self._ahead_in_circle = windows  # [2, N, steps ahead - 1, ball]: a view of `_circle`
-        steps, ball = np.divmod(np.arange(half * num), num)
-        self._ball_pairs = np.stack([ball, (ball + steps + 1) % num], axis=1)
-        self._pair_counts = (steps + 1 < num - half) | (ball < half)  # of an even number half meets twice
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return copies of all poses, velocities and sizes."""
@@ -128,7 +107,7 @@ class FoodPhysics:
         near = x * x + z * z < (BALL_RADIUS + CONTACT_GAP + np.sqrt(2) * self.agent_half[:, :, None]) ** 2
         area, agent, ball = np.nonzero(near)
         if not area.size:
-            return _NONE
+            return NONE
         x, y, z = x[near], y[near], z[near]
         yaw, half = self.agent_yaw[area, agent], self.agent_half[area, agent]
         sin, cos = np.sin(yaw), np.cos(yaw)
@@ -158,7 +137,7 @@ class FoodPhysics:
         square[0] += square[1]
         near = np.flatnonzero(square[0] < _NEAR_BALLS)
         if not near.size:
-            return _NONE
+            return NONE
         area, pair = np.divmod(near, len(self._ball_pairs))
         first = area * self._shape[1] + self._num_agents
         one, other = first + self._ball_pairs[pair].T
@@ -182,7 +161,7 @@ class FoodPhysics:
         reach = np.sqrt(2) * sizes + CONTACT_GAP
         area, pair = np.nonzero(offset[0] ** 2 + offset[2] ** 2 < reach**2)
         if not area.size:
-            return _NONE
+            return NONE
         first, second = first[pair], second[pair]
         half, yaw = self.agent_half, self.agent_yaw
         gap, normal = box_gap(
@@ -216,56 +195,7 @@ class FoodPhysics:
         friction = np.where(boxes, BOX_FRICTION, POINT_FRICTION)
         return Contacts(one, np.full(one.size, self._num_bodies), normal, gap[axis, one], friction)
 
-    # ---- solving ----------------------------------------------------------------------------------------
-
-    def _solve(self, contacts: Contacts, floor_gap: np.ndarray) -> None:
-        """Remove the approach at contacts and floor, then rub; a body's contacts share its mass."""
-        slowest = np.where(floor_gap < CONTACT_GAP, np.maximum(floor_gap, 0.0) / -TICK_S, -np.inf)
-        vertical = self._velocity[1, :-1]
-        lift = np.maximum(slowest - vertical, 0.0)
-        vertical += lift
-        if contacts.one.size:
-            one, other, normal, gap, friction = contacts
-            velocity = self._velocity
-            share = np.bincount(one, minlength=self._num_bodies + 1)
-            share += np.bincount(other, minlength=self._num_bodies + 1)
-            mobility = self._inverse_mass * share
-            mass = 1.0 / (mobility[one] + mobility[other])
-            closing = np.maximum(gap, 0.0) / TICK_S  # the gap may be closed within the tick
-            cells = self._cells(one, other)
-            push = np.concatenate(
-                [normal * self._inverse_mass[one], normal * -self._inverse_mass[other]], axis=1
-            )
-            impulse = np.zeros(one.size)
-            for _ in range(ITERATIONS):
-                speed = ((velocity[:, one] - velocity[:, other]) * normal).sum(axis=0)
-                grown = np.maximum(impulse - (speed + closing) * mass, 0.0)
-                change = grown - impulse
-                if np.abs(change).max() < NEGLIGIBLE:
-                    break
-                impulse = grown
-                _add(velocity, cells, push * np.concatenate([change, change]))
-                more = np.maximum(slowest - vertical, 0.0)
-                vertical += more
-                lift += more
-            self._rub(contacts, cells, friction * impulse, share)
-        self._rub_floor(lift.reshape(self._shape))
-
-    def _rub(self, contacts: Contacts, cells: np.ndarray, limit: np.ndarray, share: np.ndarray) -> None:
-        """Brake the slip at contacts by at most `limit` [C], kg m/s; balls are spun by it."""
-        one, other, normal, _, _ = contacts
-        slip = self._velocity[:, one] - self._velocity[:, other]
-        slip -= BALL_RADIUS * _cross(self._spin[:, one] + self._spin[:, other], normal)
-        slip -= normal * (slip * normal).sum(axis=0)
-        speed = np.sqrt((slip * slip).sum(axis=0))
-        slip /= np.maximum(speed, 1e-9)
-        mobility = share * (self._inverse_mass + BALL_RADIUS**2 * self._inverse_inertia)
-        impulse = np.minimum(speed / (mobility[one] + mobility[other]), limit)
-        torque = _cross(normal, slip) * (BALL_RADIUS * impulse)
-        slip *= impulse
-        mass, inertia = self._inverse_mass, self._inverse_inertia
-        _add(self._velocity, cells, np.concatenate([slip * -mass[one], slip * mass[other]], axis=1))
-        _add(self._spin, cells, np.concatenate([torque * inertia[one], torque * inertia[other]], axis=1))
+    # ---- the floor --------------------------------------------------------------------------------------
 
     def _rub_floor(self, lift: np.ndarray) -> None:
         """Brake bodies on the floor; `lift` [N, A + F]: vertical impulse by mass, m/s.
@@ -290,21 +220,15 @@ class FoodPhysics:
         spin[2] += slip_x * (2.5 / BALL_RADIUS)
         spin[0] -= slip_z * (2.5 / BALL_RADIUS)
 
-    def _separate(self, contacts: Contacts, floor_gap: np.ndarray) -> None:
-        """Shrink penetrations: 80 % of each, at most 10 m/s, shared by inverse mass."""
-        deep = np.flatnonzero(contacts.gap < 0)
-        if deep.size:
-            one, other = contacts.one[deep], contacts.other[deep]
-            mobility_one, mobility_other = self._inverse_mass[one], self._inverse_mass[other]
-            push = contacts.normal[:, deep] * (push_out(contacts.gap[deep]) / (mobility_one + mobility_other))
-            apart = np.concatenate([push * mobility_one, push * -mobility_other], axis=1)
-            _add(self._position, self._cells(one, other), apart)
-        self._position[1, :-1] += push_out(floor_gap)
-
-    def _cells(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Return the places of both bodies' x, y, z in flattened [3, B + 1], int [3 * 2 C]."""
-        both = np.concatenate([one, other])
-        return (_ROWS * (self._num_bodies + 1) + both).reshape(-1)
+    def _compare_in_circle(self) -> None:
+        """Lay out the comparison of each ball with the next half of its area's balls, in a circle."""
+        num, half = self._num_balls, self._num_balls // 2
+        self._circle = np.zeros((2, self._shape[0], num + half), np.float32)  # x, z; the first half again
+        windows = np.lib.stride_tricks.sliding_window_view(self._circle[:, :, 1:], num, axis=2)
+        self._ahead_in_circle = windows  # [2, N, steps ahead - 1, ball]: a view of `_circle`
+        steps, ball = np.divmod(np.arange(half * num), num)
+        self._ball_pairs = np.stack([ball, (ball + steps + 1) % num], axis=1)
+        self._pair_counts = (steps + 1 < num - half) | (ball < half)  # of an even number half meets twice
 
     def _views(self, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the agents' and the balls' part of an array [3, B + 1], as views."""
@@ -313,20 +237,5 @@ class FoodPhysics:
         return by_area[:, :, : self._num_agents], by_area[:, :, self._num_agents :]
 
 
-_ROWS = np.arange(3)[:, None]
-_NEAR_BALLS = np.float32(1.001 * (2 * BALL_RADIUS + CONTACT_GAP) ** 2)  # m^2, in single precision
-_NONE = Contacts(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((3, 0)), np.zeros(0), np.zeros(0))
 _STATE = ("_position", "_velocity", "_spin", "_reach", "agent_yaw")
-
-
-def _add(bodies: np.ndarray, cells: np.ndarray, values: np.ndarray) -> None:
-    """Add `values` [3, 2 C] to `cells` of `bodies` [3, B + 1]; a cell may occur several times."""
-    np.add.at(bodies.reshape(-1), cells, values.reshape(-1))
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
-
-
-def _joined(parts: list[Contacts]) -> Contacts:
-    return Contacts(*(np.concatenate(columns, axis=-1) for columns in zip(*parts, strict=True)))
+_NEAR_BALLS = np.float32(1.001 * (2 * BALL_RADIUS + CONTACT_GAP) ** 2)  # m^2, in single precision
