@@ -22,7 +22,9 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorSpec, DecisionSteps  # noqa: E402
+from omegaconf import OmegaConf  # noqa: E402
 
+from mappo_unity.presets import conf_dir  # noqa: E402
 from mappo_unity.scenes import make_scene, scene_names  # noqa: E402
 
 Policy = Callable[[BehaviorSpec, DecisionSteps], ActionTuple]
@@ -80,22 +82,32 @@ def measure(scene: str, num_areas: int | None, policy: Policy, seconds: float, r
     return f"{areas!s:>6} {statistics.median(rates):>14,.0f} {min(rates):>12,.0f} {max(rates):>12,.0f}"
 
 
+def usual_areas(scene: str) -> list[int | None]:
+    """Return the Unity scene's number of areas (None), and that of the preset where it has another."""
+    preset = conf_dir() / "env" / f"{scene}.yaml"
+    areas = OmegaConf.select(OmegaConf.load(preset), "env.num_areas") if preset.is_file() else None
+    return [None] if areas is None else [None, int(areas)]
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scenes", nargs="*", help="default: all scenes, and 3DBall with 128 areas")
-    parser.add_argument("--num-areas", type=int, default=None, help="default: as many as the Unity scene has")
+    parser.add_argument("scenes", nargs="*", help="default: all scenes")
+    parser.add_argument(
+        "--num-areas", type=int, default=None, help="default: as the Unity scene, then as the preset"
+    )
     parser.add_argument("--seconds", type=float, default=2.0, help="of one repeat")
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
     rows = [
-        (scene, "random", options.num_areas, random_policy()) for scene in options.scenes or scene_names()
+        (scene, "random", num_areas, random_policy())
+        for scene in options.scenes or scene_names()
+        for num_areas in ([options.num_areas] if options.num_areas else usual_areas(scene))
     ]
     if "3DBall" in (options.scenes or ["3DBall"]):
-        many = options.num_areas or 128
-        rows += [("3DBall", "random", many, random_policy()), ("3DBall", "balance", many, balance)]
+        rows.append(("3DBall", "balance", options.num_areas or 128, balance))
     print(f"{'scene':<18} {'policy':<8} {'areas':>6} {'decisions/s':>14} {'lowest':>12} {'highest':>12}")
     for scene, label, num_areas, policy in rows:
         print(f"{scene:<18} {label:<8} {measure(scene, num_areas, policy, options.seconds, options.repeats)}")
