@@ -8,6 +8,7 @@ Legend: n contacts, M bodies, of which the first F are the balls and the last on
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -55,37 +56,60 @@ class Bodies:
         self.constants[:, -1] = 0
         self.inverse_mass = self.constants[0]
 
-    def solve(self, contacts: Contacts, tick_s: float) -> np.ndarray:
-        """Stop or bounce approaching pairs and rub them; return which contacts bounce, bool [n]."""
-        rows = _Rows(self, contacts, tick_s)
-        shared = self._shared(contacts.i, contacts.j)
-        if not shared.any():
-            rows.iterate()
-            return rows.bounces
-        alone = np.flatnonzero(~shared)
-        if alone.size:
-            rows.part(alone).iterate()
-        ranks = [rows.part(rank) for rank in self._ranks(contacts, shared)]
-        for _ in range(ITERATIONS):
-            if max([np.abs(rank.iterate()).max() for rank in ranks]) < _SETTLED:
+    def solve(self, contacts: Contacts, tick_s: float) -> Solved:
+        """Stop or bounce approaching pairs and rub them."""
+        solved = Solved(self, contacts, tick_s)
+        solved.repeat(_Rows.stop)
+        return solved
+
+
+class Solved:
+    """The contacts of one solve, parted into rows that can be solved at once."""
+
+    def __init__(self, bodies: Bodies, contacts: Contacts, tick_s: float) -> None:
+        self._all = _Rows(bodies, contacts, tick_s)
+        shared = _shared(contacts, len(bodies.spin))
+        self._alone, self._ranks = self._all, []
+        if shared is not None:
+            self._alone = self._all.part(np.flatnonzero(~shared))
+            self._ranks = [self._all.part(rank) for rank in _ranks(contacts, shared, bodies.num_balls)]
+
+    def repeat(self, iterate: Callable[[_Rows], np.ndarray]) -> None:
+        """Iterate once over contacts that share no body, up to six times over the others."""
+        if len(self._alone.i):
+            iterate(self._alone)
+        for _ in range(ITERATIONS if self._ranks else 0):
+            if max([np.abs(iterate(rank)).max() for rank in self._ranks]) < _SETTLED:
                 break
-        return rows.bounces
 
-    def _shared(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        """Return which contacts have a body in common with another one, the pitch excepted."""
-        count = np.bincount(np.concatenate([i, j]), minlength=len(self.spin))
-        count[-1] = 0
-        many = count > 1
-        return many[i] | many[j]
+    def push_out(self, moves: np.ndarray, share: float, most: float) -> None:
+        """Add to `moves`, the bodies' ways in this tick [2, M] m, so that penetrations shrink.
 
-    def _ranks(self, contacts: Contacts, shared: np.ndarray) -> list[np.ndarray]:
-        """Return rows of the shared contacts: the first of every field, the second of every field, ..."""
-        rows = np.flatnonzero(shared)
-        field = contacts.i[rows] % self.num_balls
-        order = np.argsort(field, kind="stable")
-        rows, field = rows[order], field[order]
-        rank = np.arange(len(rows)) - np.searchsorted(field, field)
-        return [rows[rank == k] for k in range(int(rank.max()) + 1)]
+        A tick removes `share` of a penetration, at most `most` m; pairs apart do not get into each other.
+        Contacts that bounce are left alone. Ways, not speeds: nothing of it is kept.
+        """
+        rows = self._all
+        short = rows.missing(moves, share, most)
+        if (short > 0).any():
+            self.repeat(lambda part: part.push(moves, share, most))
+
+
+def _shared(contacts: Contacts, num_bodies: int) -> np.ndarray | None:
+    """Return which contacts have a body in common with another one, the pitch excepted; None: none has."""
+    count = np.bincount(np.concatenate([contacts.i, contacts.j]), minlength=num_bodies)
+    count[-1] = 0
+    many = count > 1
+    return many[contacts.i] | many[contacts.j] if many.any() else None
+
+
+def _ranks(contacts: Contacts, shared: np.ndarray, num_fields: int) -> list[np.ndarray]:
+    """Return rows of the shared contacts: the first of every field, the second of every field, ..."""
+    rows = np.flatnonzero(shared)
+    field = contacts.i[rows] % num_fields
+    order = np.argsort(field, kind="stable")
+    rows, field = rows[order], field[order]
+    rank = np.arange(len(rows)) - np.searchsorted(field, field)
+    return [rows[rank == k] for k in range(int(rank.max()) + 1)]
 
 
 class _Rows:
@@ -93,28 +117,27 @@ class _Rows:
 
     def __init__(self, bodies: Bodies, contacts: Contacts, tick_s: float) -> None:
         self.velocity, self.spin = bodies.velocity, bodies.spin
-        self.i, self.j, self.normal_x, self.normal_z, gap = contacts
+        self.i, self.j, self.normal_x, self.normal_z, self.gap = contacts
         x, z = self.velocity[:, self.i] - self.velocity[:, self.j]
         approach = -x * self.normal_x - z * self.normal_z
         self.bounces = (approach > BOUNCE_SPEED) & (self.i < bodies.num_balls)
-        self.leave_speed = np.where(self.bounces, RESTITUTION * approach, np.maximum(gap, 0) * (-1 / tick_s))
+        allowed = np.maximum(self.gap, 0) * (-1 / tick_s)
+        self.leave_speed = np.where(self.bounces, RESTITUTION * approach, allowed)
         self.weight_i, rub_weight, self.lever, self.spin_gain = bodies.constants[:, self.i]
         self.weight_j = bodies.inverse_mass[self.j]
         self.mass = 1 / (self.weight_i + self.weight_j)
         self.rub_mass = 1 / (rub_weight + self.weight_j)
-        self.press = self.rub = np.zeros(len(gap))
+        self.press = self.rub = self.pushed = np.zeros(len(self.gap))
 
     def part(self, rows: np.ndarray) -> _Rows:
         """Return these rows alone."""
         part = object.__new__(_Rows)
-        part.velocity, part.spin = self.velocity, self.spin
         for name, value in vars(self).items():
-            if name not in ("velocity", "spin"):
-                setattr(part, name, value[rows])
+            setattr(part, name, value if name in ("velocity", "spin") else value[rows])
         return part
 
-    def iterate(self) -> np.ndarray:
-        """Apply one iteration, if no two contacts share a body; return the changes of `press`."""
+    def stop(self) -> np.ndarray:
+        """Apply one iteration to speeds, if no two contacts share a body; return changes of `press`."""
         velocity, spin, i, j = self.velocity, self.spin, self.i, self.j
         normal_x, normal_z = self.normal_x, self.normal_z
         x, z = velocity[:, i] - velocity[:, j]
@@ -124,11 +147,27 @@ class _Rows:
         rubbed = np.minimum(np.maximum(self.rub - slip * self.rub_mass, -limit), limit)
         press, rub = pressed - self.press, rubbed - self.rub
         self.press, self.rub = pressed, rubbed
-        x = press * normal_x - rub * normal_z
-        z = press * normal_z + rub * normal_x
-        velocity[0, i] += x * self.weight_i
-        velocity[1, i] += z * self.weight_i
-        velocity[0, j] -= x * self.weight_j
-        velocity[1, j] -= z * self.weight_j
+        self._apply(velocity, press * normal_x - rub * normal_z, press * normal_z + rub * normal_x)
         spin[i] += rub * self.spin_gain
         return press
+
+    def missing(self, moves: np.ndarray, share: float, most: float) -> np.ndarray:
+        """Return how much further apart the pairs must move, m [n]."""
+        x, z = moves[:, self.i] - moves[:, self.j]
+        deep = np.minimum(self.gap, 0)
+        wanted = np.minimum(-share * deep, most) + deep - self.gap - x * self.normal_x - z * self.normal_z
+        return np.where(self.bounces, -1.0, wanted)
+
+    def push(self, moves: np.ndarray, share: float, most: float) -> np.ndarray:
+        """Apply one iteration to ways, as `stop` does to speeds; return changes of `pushed`."""
+        pushed = np.maximum(self.pushed + self.missing(moves, share, most) * self.mass, 0)
+        push = np.where(self.bounces, 0, pushed - self.pushed)
+        self.pushed = self.pushed + push
+        self._apply(moves, push * self.normal_x, push * self.normal_z)
+        return push
+
+    def _apply(self, to: np.ndarray, x: np.ndarray, z: np.ndarray) -> None:
+        to[0, self.i] += x * self.weight_i
+        to[1, self.i] += z * self.weight_i
+        to[0, self.j] -= x * self.weight_j
+        to[1, self.j] -= z * self.weight_j

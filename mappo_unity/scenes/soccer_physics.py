@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from mappo_unity.scenes.soccer_contacts import Bodies, Contacts
+from mappo_unity.scenes.soccer_contacts import Bodies, Contacts, Solved
 from mappo_unity.scenes.soccer_pitch import BALL_HEIGHT, GOAL_FLOOR_X, MARGIN, POST_X, Gaps, Pitch
 
 TICK_S = 0.02
@@ -78,9 +78,9 @@ class SoccerPhysics:
         self._accelerate(drive)
         contacts, begun = self._contacts()
         points = self._kick_points(begun) if begun.any() else None
-        bounces = self._bodies.solve(contacts, TICK_S) if len(contacts.i) else None
+        solved = self._bodies.solve(contacts, TICK_S) if len(contacts.i) else None
         start = self.position
-        self.position = start + self._moves(contacts, bounces)
+        self.position = start + self._moves(solved)
         self._stop_at_pitch(start)
         if points is not None:
             self._kick(begun, points, kick_power)
@@ -135,7 +135,7 @@ class SoccerPhysics:
             return parts[0], begun
         return (Contacts(*map(np.concatenate, zip(*parts, strict=True))) if parts else _NO_CONTACTS), begun
 
-    def _moves(self, contacts: Contacts, bounces: np.ndarray | None) -> np.ndarray:
+    def _moves(self, solved: Solved | None) -> np.ndarray:
         """Return the ways of a tick [2, B, F]: velocity, less the balls' slip, plus push-out.
 
         The floor takes way but no speed from the ball, and a push-out gives way but no speed: both act in
@@ -145,18 +145,8 @@ class SoccerPhysics:
         x, z = ball = moves[:, : self.num_fields]
         way = np.sqrt(x * x + z * z) + 1e-12
         ball *= 1 - np.minimum(SLIP_SHARE, SLIP_WAY / way)
-        if bounces is not None:
-            i, j, normal_x, normal_z, gap = contacts
-            closing = (moves[0, j] - moves[0, i]) * normal_x + (moves[1, j] - moves[1, i]) * normal_z
-            deep = np.minimum(gap, 0)
-            push = np.minimum(-PUSH_OUT * deep, MAX_PUSH_OUT) + closing + deep - gap
-            push = np.where(bounces, 0, np.maximum(push, 0))
-            if push.any():
-                weight_i, weight_j = self._bodies.inverse_mass[i], self._bodies.inverse_mass[j]
-                push /= weight_i + weight_j
-                for axis, normal in enumerate((normal_x, normal_z)):
-                    np.add.at(moves[axis], i, push * normal * weight_i)
-                    np.subtract.at(moves[axis], j, push * normal * weight_j)
+        if solved is not None:
+            solved.push_out(moves, PUSH_OUT, MAX_PUSH_OUT)
         return moves[:, : self._last].reshape(self.position.shape)
 
     def _stop_at_pitch(self, start: np.ndarray) -> None:
