@@ -51,10 +51,11 @@ HALVES = np.array(
         (0.75, 0.75, 0.75),
         KEY_HALF,
         (COLUMN_BASE_HALF[0], 2.0, COLUMN_BASE_HALF[2]),
-        AGENT_HALF,
+        (AGENT_HALF[0], 2.0, AGENT_HALF[2]),
     ]
 )
 """Half sizes [7, 3] of what agents meet.
 
-A column is as wide as its base, a tombstone as wide as its lower box: steps that an agent cannot climb.
+A column is as wide as its base, a tombstone as its lower box: steps that an agent cannot climb. Agents
+are taller to each other than they are, so that those that collide fast are never put one on the other.
 """

@@ -36,6 +36,7 @@ DRAG_KEPT = 1.0 - 2.0 * TICK_S
 AGENT_HALF = (0.5, 0.5, 0.5)
 NUM_STONES = 6  # stone pyramids of an area
 SWITCH_HALF = (2.0, 2.0, 2.0)
+TALL = 10.0  # m: half the height of what stops agents; all contacts are sideways
 SWITCH_INERTIA = 1.0 * (4.0**2 + 4.0**2) / 12.0  # kg m^2, about the vertical
 SPIN_KEPT = 1.0 - 0.05 * TICK_S
 MAX_SPIN = 7.0  # rad/s: the engine's limit
@@ -171,7 +172,8 @@ class PyramidsBodies:
         if not areas.size:
             return touching
         offset, yaw, turn = offset[areas], self.yaw[areas], self.switch_yaw[areas]
-        gap, normal = box_gap(offset, yaw, AGENT_HALF, SWITCH_HALF, turn)
+        offset[:, 1] = 0.0
+        gap, normal = box_gap(offset, yaw, AGENT_HALF, (SWITCH_HALF[0], TALL, SWITCH_HALF[2]), turn)
         rows = np.flatnonzero(gap < CONTACT_GAP)
         if rows.size:
             touching[areas[rows]] = True
@@ -216,7 +218,7 @@ class PyramidsBodies:
             return
         offset = np.zeros((len(areas), 3))
         offset[:, ::2] = beside[areas, blocks]
-        half = np.full((len(areas), 3), 10.0)  # too high to matter
+        half = np.full((len(areas), 3), TALL)
         half[:, ::2] = self._half[blocks]
         gap, normal = box_gap(offset, self.yaw[areas], AGENT_HALF, half)
         first = np.r_[True, areas[1:] != areas[:-1]]
