@@ -123,7 +123,7 @@ def config_to_play(run: Path, env: str | None) -> Config:
     try:
         return load_config(find_run(run, "run") / CONFIG)
     except ConfigError as error:
-        if not run.is_file():
+        if not run.is_file() and not list(run.glob("*.onnx")):
             raise
         choices = ", ".join(group_choices()["env"])
         raise ConfigError(f"{error}; or say in which environment to play it: env=NAME ({choices})") from error

@@ -15,7 +15,7 @@ from mappo_unity.backend import make_env_function
 from mappo_unity.compose import config_to_play
 from mappo_unity.episodes import play, summarize
 from mappo_unity.matches import Score, play_matches
-from mappo_unity.onnx_policy import SUFFIX, OnnxPolicy
+from mappo_unity.onnx_policy import SUFFIX, OnnxFolder, OnnxPolicy
 from mappo_unity.policies import CheckpointPolicy, Policy, RandomPolicy
 
 
@@ -46,7 +46,11 @@ def evaluate(
     policy = open_policy(str(run), deterministic, seed)
     make_env = make_env_function(config_to_play(run, env).env)
     head = {"policy": str(getattr(policy, "path", run)), "deterministic": deterministic, "seed": seed}
-    head |= {"agent_steps": policy.agent_steps} if isinstance(policy, (CheckpointPolicy, OnnxPolicy)) else {}
+    head |= (
+        {"agent_steps": policy.agent_steps}
+        if isinstance(policy, (CheckpointPolicy, OnnxPolicy, OnnxFolder))
+        else {}
+    )
     if opponent is not None:
         other = open_policy(opponent, deterministic, seed)
         scores = play_matches(make_env, policy, other, episodes, seed)
@@ -69,11 +73,13 @@ def match_figures(scores: dict[str, Score]) -> dict[str, Any]:
 
 
 def open_policy(where: str, deterministic: bool, seed: int) -> Policy:
-    """Return "random", or the policy of a run folder, checkpoint or ONNX file."""
+    """Return "random", or the policy of a run folder, checkpoint, ONNX file or folder of ONNX files."""
     if where == "random":
         return RandomPolicy(seed)
     if where.endswith(SUFFIX):
         return OnnxPolicy(Path(where), deterministic, seed)
+    if list(Path(where).glob(f"*{SUFFIX}")) and not list(Path(where).glob("*.pt")):
+        return OnnxFolder(Path(where), deterministic, seed)
     return CheckpointPolicy(choose_checkpoint(Path(where)), deterministic)
 
 

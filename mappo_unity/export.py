@@ -8,7 +8,6 @@ or not at all, and only after onnxruntime has played them as torch plays the che
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from mappo_unity import checkpoint, keys
 from mappo_unity.atomic import write_atomically
 from mappo_unity.onnx_check import compare
 from mappo_unity.onnx_graph import ExportError, build_model
-from mappo_unity.onnx_policy import SUFFIX
+from mappo_unity.onnx_policy import SUFFIX, file_name
 from mappo_unity.policies import CheckpointPolicy
 
 SAMPLE_ROWS = 64  # observations that a checkpoint keeps of each policy
@@ -153,14 +152,10 @@ def _output_paths(names: list[str], path: Path, out: Path | None) -> dict[str, P
     if out is None:
         out = path.with_suffix(SUFFIX)
     elif out.is_dir() or out.suffix != SUFFIX:
-        return {name: out / f"{_file_name(name)}{SUFFIX}" for name in names}
+        return {name: out / file_name(name) for name in names}
     if len(names) == 1:
         return {names[0]: out}
-    return {name: out.with_name(f"{out.stem}_{_file_name(name)}{SUFFIX}") for name in names}
-
-
-def _file_name(policy: str) -> str:
-    return re.sub(r"[^\w.-]", "_", policy)
+    return {name: out.with_name(f"{out.stem}_{file_name(name)}") for name in names}
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -34,7 +34,7 @@ Play episodes with a trained policy and print their statistics: a table, then on
 
 Usage:
   mappo-eval run=RUN [option=value ...]     a run folder (its best checkpoint) or a checkpoint
-  mappo-eval run=FILE.onnx [env=NAME ...]   an ONNX file, in its run's environment or another
+  mappo-eval run=FILE.onnx [env=NAME ...]   an ONNX file, or a folder of them (NAME.onnx for each behavior)
   mappo-eval --help | --version
 
 Example:

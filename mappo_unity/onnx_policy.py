@@ -1,4 +1,4 @@
-"""An ONNX file as a policy: our own exports and those of ML-Agents (model formats 2 and 3).
+"""ONNX files as policies: our own exports and those of ML-Agents (model formats 2 and 3).
 
 In: a file, the records of a BaseEnv. Out: ActionTuples. Knows nothing of checkpoints or torch.
 
@@ -9,6 +9,7 @@ Recurrent files get each agent's memory back until its episode ends.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps
 
+from mappo_unity import keys
 from mappo_unity.config import ConfigError
 from mappo_unity.onnx_graph import import_package
 
@@ -77,6 +79,12 @@ class OnnxPolicy:
         """Raise ConfigError if this file cannot play that behavior."""
         if behavior in self._fits:
             return
+        name = self.metadata.get("behavior_name")
+        if name not in (None, keys.policy_name(behavior)):
+            raise ConfigError(
+                f"the ONNX file {self.path} plays {name!r}, but the environment has {behavior!r}; "
+                "a folder with a file for each behavior plays several"
+            )
         wanted, given = self._wanted_sizes(), self._given_sizes(spec)
         if wanted != given:
             raise ConfigError(
@@ -162,6 +170,45 @@ class OnnxPolicy:
         parts = np.split(log_probs, np.cumsum(branches)[:-1], axis=1)
         noise = [0.0 if self.deterministic else self.rng.gumbel(size=part.shape) for part in parts]
         return np.stack([(part + extra).argmax(1) for part, extra in zip(parts, noise)], axis=1)
+
+
+class OnnxFolder:
+    """Play each behavior with the file of its name in a folder (``SmallWallJump.onnx`` ...).
+
+    Args:
+        path: the folder.
+        deterministic: take the most likely action instead of a sampled one.
+        seed: of what is drawn.
+    """
+
+    agent_steps = None
+
+    def __init__(self, path: Path, deterministic: bool, seed: int = 0) -> None:
+        self.path, self.deterministic, self.seed = path, deterministic, seed
+        self._policies: dict[str, OnnxPolicy] = {}
+
+    def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
+        """Return an action for every row of ``steps``."""
+        return self._policy(behavior).act(behavior, steps, spec)
+
+    def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Drop the memory of agents that begin an episode."""
+        self._policy(behavior).forget(behavior, agent_ids)
+
+    def _policy(self, behavior: str) -> OnnxPolicy:
+        name = keys.policy_name(behavior)
+        if name not in self._policies:
+            path = self.path / file_name(name)
+            if not path.is_file():
+                files = sorted(p.name for p in self.path.glob(f"*{SUFFIX}"))
+                raise ConfigError(f"{behavior!r} needs a file {path}; there are {', '.join(files) or 'none'}")
+            self._policies[name] = OnnxPolicy(path, self.deterministic, self.seed)
+        return self._policies[name]
+
+
+def file_name(policy: str) -> str:
+    """Return the name of a policy's file: its own, with ``_`` for what a file name may not hold."""
+    return re.sub(r"[^\w.-]", "_", policy) + SUFFIX
 
 
 def open_session(data: bytes, name: str, seed: int = 0) -> Any:

@@ -3,6 +3,7 @@
 import numpy as np
 import onnx
 import pytest
+import torch
 from fakes import behavior_spec
 from mlagents_envs.base_env import (
     ActionSpec,
@@ -15,7 +16,7 @@ from mlagents_envs.base_env import (
 from onnx_fakes import data_of, make, official_policy
 
 from mappo_unity.config import ConfigError
-from mappo_unity.onnx_policy import OnnxPolicy
+from mappo_unity.onnx_policy import OnnxFolder, OnnxPolicy
 
 WALL_JUMP = (3, 3, 3, 2)
 
@@ -126,7 +127,7 @@ def test_the_same_seed_draws_the_same(ball):
 def ball(tmp_path):
     """Return a file for 3DBall's sensors and actions."""
     path = tmp_path / "ball.onnx"
-    path.write_bytes(data_of(make([[8]], 2), [[8]]))
+    path.write_bytes(data_of(make([[8]], 2), [[8]], "3DBall"))
     return path
 
 
@@ -137,12 +138,32 @@ def test_a_file_that_does_not_fit_says_what_both_are(ball, tmp_path):
         ConfigError,
         match=r"obs_0 \[8\], continuous_actions \[2\], but .* obs_0 \[5\], .*discrete_actions \[1\]",
     ):
-        policy.act("Other?team=0", decisions([5], (3,)), wrong)
+        policy.act("3DBall?team=0", decisions([5], (3,)), wrong)
+    with pytest.raises(ConfigError, match="plays '3DBall', but the environment has 'Other"):
+        policy.act("Other?team=0", decisions([8]), spec_of([8], ActionSpec(2, ())))
     (tmp_path / "text.onnx").write_text("no model")
     with pytest.raises(ConfigError, match="text.onnx is no ONNX model that onnxruntime can run"):
         OnnxPolicy(tmp_path / "text.onnx", False)
     with pytest.raises(ConfigError, match="does not exist"):
         OnnxPolicy(tmp_path / "none.onnx", False)
+
+
+def test_a_folder_plays_each_behavior_with_its_own_file(tmp_path):
+    """The two files differ in a bias of 0.3, so their means differ by 0.1."""
+    spec, steps = spec_of([4], ActionSpec(1, ())), decisions([4])
+    for bias, name in ((0.0, "Small"), (0.3, "Big er")):
+        actor = make([[4]], 1)
+        with torch.no_grad():
+            actor[0].module.net[-1].weight.zero_()
+            actor[0].module.net[-1].bias.fill_(bias)
+        (tmp_path / f"{name.replace(' ', '_')}.onnx").write_bytes(data_of(actor, [[4]], name))
+    folder = OnnxFolder(tmp_path, deterministic=True)
+    assert np.allclose(folder.act("Small?team=0", steps, spec).continuous, 0.0)
+    assert np.allclose(folder.act("Big er?team=1", steps, spec).continuous, 0.1)
+    with pytest.raises(
+        ConfigError, match="'Huge' needs a file .*Huge.onnx; there are Big_er.onnx, Small.onnx"
+    ):
+        folder.act("Huge", steps, spec)
 
 
 def test_a_model_of_another_kind_is_refused(tmp_path):
