@@ -125,7 +125,7 @@ class Ball3D(Ranges):
         x, y, z = self.scene.ball_position.T
         self.within("ball y", y, -2.3, 4.8)
         self.within("ball |x|, |z|", np.maximum(np.abs(x), np.abs(z)), 0, 3.3)
-        self.within("cube quaternion x, z", self.scene.cube_rotation[:, 1::2], -0.3, 0.3)
+        self.within("cube quaternion x, z", self.scene.cube_rotation[:, 1::2], -0.35, 0.35)
 
 
 class Basic(Ranges):

@@ -147,8 +147,8 @@ def _play(env: Any, ranges: Any, report: Report, num_ticks: int, play: RandomPla
 def _check_records(name: str, steps: DecisionSteps | TerminalSteps, ranges: Any, report: Report) -> None:
     if not len(steps):
         return
-    rewards = max(float(np.abs(steps.reward).max()), float(np.abs(steps.group_reward).max()))
-    largest = max(float(np.abs(obs).max()) for obs in steps.obs)  # NaN if there is one
+    rewards = float(np.max([np.abs(steps.reward), np.abs(steps.group_reward)]))  # NaN if there is one
+    largest = float(np.max([np.abs(obs).max() for obs in steps.obs]))
     if not (np.isfinite(rewards) and np.isfinite(largest)):
         ranges.fault(f"observations and rewards of {name} are finite", f"agents {steps.agent_id.tolist()}")
         return
