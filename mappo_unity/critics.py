@@ -18,6 +18,7 @@ from mappo_unity.encoders import Encoder, ObsLayout
 from mappo_unity.layers import ACTIVATIONS, linear, make_mlp
 
 ATTENTION_HEADS = 4
+CRITIC_GAIN = 0.01  # first values near 0: whatever the scale of returns, they are no noise to be unlearned
 
 
 class LocalCritic(nn.Module):
@@ -27,7 +28,7 @@ class LocalCritic(nn.Module):
         super().__init__()
         self.encoder = Encoder(obs, cfg.normalize_obs)
         hidden = list(cfg.critic_hidden or cfg.hidden)
-        self.net = make_mlp(self.encoder.size, hidden, 1, cfg.activation, last_gain=1.0)
+        self.net = make_mlp(self.encoder.size, hidden, 1, cfg.activation, last_gain=CRITIC_GAIN)
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return values."""
@@ -48,7 +49,7 @@ class CentralCritic(nn.Module):
         self.joint = linear(team_size * (self.encoder.size + 1), first, 2**0.5)
         self.member = nn.Parameter(torch.randn(team_size, first) * 0.1)
         self.activation = ACTIVATIONS[cfg.activation]()
-        self.net = make_mlp(first, rest, 1, cfg.activation, last_gain=1.0)
+        self.net = make_mlp(first, rest, 1, cfg.activation, last_gain=CRITIC_GAIN)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return values; the arguments are the observation entries, ``present`` and ``departed``."""
@@ -74,7 +75,7 @@ class PooledCritic(nn.Module):
             if cfg.critic is CriticKind.attention
             else None
         )
-        self.net = make_mlp(2 * first + 1, rest or [first], 1, cfg.activation, last_gain=1.0)
+        self.net = make_mlp(2 * first + 1, rest or [first], 1, cfg.activation, last_gain=CRITIC_GAIN)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return values; the arguments are the observation entries, ``present`` and ``departed``."""
