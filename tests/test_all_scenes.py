@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import signal
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,6 +22,7 @@ from mappo_unity.scenes import make_scene, scene_names
 from mappo_unity.scenes.check import check_env
 from mappo_unity.train import Outcome, Trainer
 
+ROOT = Path(__file__).resolve().parents[1]
 AREAS = 2
 TINY = [
     f"env.num_areas={AREAS}",
@@ -56,6 +56,14 @@ def test_preset_composes_and_makes_the_scene(name: str) -> None:
     config = compose_config([f"env={name}"]).config
     assert config.env.name == name
     assert config.env.num_areas is not None, "a preset states its areas"
+
+
+@every_scene
+def test_page_and_picture_are_in_the_index(name: str) -> None:
+    folder = ROOT / "docs" / "scenes"
+    index = (folder / "README.md").read_text(encoding="utf-8")
+    assert f"[{name}]({name}.md)" in index and f"({name}.png)" in index
+    assert (folder / f"{name}.md").is_file() and (folder / f"{name}.png").is_file()
 
 
 @every_scene
@@ -97,9 +105,14 @@ def test_two_iterations_are_one_saved_and_one_more_to_the_bit(name: str, tmp_pat
     assert whole.agent_steps == second.agent_steps > first.agent_steps > 0
     assert len(rows(tmp_path / "whole")) == 2
     assert rows(tmp_path / "whole") == rows(tmp_path / "parts")
-    states = [checkpoint.load(outcome.last_checkpoint) for outcome in (whole, second)]
-    assert_same(*map(without_times, states))
-    assert learned(checkpoint.load(first.last_checkpoint), states[0]), "the second iteration changed nothing"
+    one, two, once = (loaded(outcome) for outcome in (whole, second, first))
+    assert_same(without_times(one), without_times(two))
+    assert learned(once, one), "the second iteration changed nothing"
+
+
+def loaded(outcome: Outcome) -> dict[str, Any]:
+    assert outcome.last_checkpoint is not None
+    return checkpoint.load(outcome.last_checkpoint)
 
 
 def learned(before: dict[str, Any], after: dict[str, Any]) -> bool:
@@ -141,13 +154,13 @@ def test_random_play_ends_episodes(name: str) -> None:
 # ---- ranges ------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def soaking() -> Any:
-    """Give scripts/soak_scenes.py as a module."""
-    folder = str(Path(__file__).resolve().parents[1] / "scripts")
-    sys.path.insert(0, folder)
-    yield importlib.import_module("soak_scenes")
-    sys.path.remove(folder)
+@pytest.fixture
+def soaking(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Give scripts/soak_scenes.py as a module; memory may grow, since seconds are no warm-up."""
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    module = importlib.import_module("soak_scenes")
+    monkeypatch.setattr(module, "MAX_GROWTH", np.inf)
+    return module
 
 
 def faults(report: Any) -> str:
@@ -156,7 +169,6 @@ def faults(report: Any) -> str:
 
 @every_scene
 def test_resets_and_bodies_stay_in_their_ranges(name: str, soaking: ModuleType) -> None:
-    soaking.MAX_GROWTH = np.inf  # of two seconds
     report = soaking.soak(name, hours=0.003, num_areas=AREAS)
     assert not report.faults, faults(report)
     assert report.resets >= AREAS and report.decisions > 0
@@ -177,7 +189,6 @@ def test_soaking_finds_what_is_wrong(soaking: ModuleType, monkeypatch: pytest.Mo
         frames[1][:] = np.nan
         return frames
 
-    monkeypatch.setattr(soaking, "MAX_GROWTH", np.inf)
     with monkeypatch.context() as patch:
         patch.setattr(Hallway, "begin_episode", begin_too_far)
         assert "begin: agent z not in -20 .. -10" in faults(soaking.soak("Hallway", 0.001, 8))
