@@ -115,12 +115,12 @@ def stop(
     velocity: np.ndarray,
     normal: np.ndarray,
     gap: np.ndarray,
-    friction: float = BOX_FRICTION,
+    friction: np.ndarray | float = BOX_FRICTION,
 ) -> np.ndarray:
     """Stop boxes that approach something immovable, in place; return the impulse ``[n]`` by mass, m/s.
 
     `velocity`, `normal` ``[n, 3]``; `gap` ``[n]``, m, may still be closed within the tick. Inelastic;
-    friction takes at most `friction` * impulse of the speed along the surface.
+    friction takes at most `friction` (``[n]`` or one for all) * impulse of the speed along the surface.
     """
     speed = np.einsum("ni,ni->n", velocity, normal)
     impulse = np.maximum(-speed - np.maximum(gap, 0.0) / TICK_S, 0.0)
