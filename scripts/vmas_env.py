@@ -169,10 +169,11 @@ class VmasEnv(BaseEnv):
         """
         generator, (kind, words, *rest), (version, internal, gauss) = self._rng
         decisions, terminals = self._records
+        rng = [generator.numpy().copy(), kind, np.array(words), *rest, version, np.array(internal), gauss]
         return {
-            "tensors": {name: np.array(holder[key]) for name, holder, key in self._tensors()},
+            "tensors": {name: holder[key].numpy().copy() for name, holder, key in self._tensors()},
             "clock": self._clock.copy(),
-            "rng": [np.array(generator), kind, np.array(words), *rest, version, np.array(internal), gauss],
+            "rng": rng,
             "obs": decisions.obs[0].copy(),
             "reward": decisions.reward.copy(),
             "ended": terminals.agent_id.copy(),
