@@ -377,8 +377,8 @@ class DungeonEscape(Ranges):
     def tick(self) -> None:
         """Check that agents and dragon are within the walls (faces at 12.5 m) and above the floor.
 
-        Detection is discrete, as in Unity: an agent that runs at 30 m/s goes on for up to 0.6 m before the wall
-        stops it, so that its centre may be 0.1 m past the face for a tick.
+        Detection is discrete, as in Unity: an agent that runs at 30 m/s goes on for up to 0.6 m before the
+        wall stops it, so that its centre may be 0.1 m past the face for a tick.
         """
         room = self.scene.room
         self.within("agent x, z", room.position[:, ::2], -12.6, 12.6)
