@@ -55,9 +55,9 @@ _TAGS = np.array(
     [WALL_TAG] * _NUM_BASES
     + [LOCK_TAG, PORTAL_TAG, DRAGON_TAG, KEY_TAG, WALL_TAG, WALL_TAG, KEY_TAG]
     + [AGENT_TAG] * NUM_AGENTS
-    + [WALL_TAG] * len(_COLUMNS)
     + [WALL_TAG] * 2
-)  # boxes, columns, the walls across and along
+)  # columns with their bases, boxes, the walls across and along
+_COLUMN_REACH = COLUMN_RADIUS + EYES.radius
 
 
 def see(room: DungeonRoom, slots: np.ndarray, enabled: np.ndarray) -> np.ndarray:
@@ -70,19 +70,17 @@ def see(room: DungeonRoom, slots: np.ndarray, enabled: np.ndarray) -> np.ndarray
     low, high = centre[..., 1] - _HALVES[:, 1], centre[..., 1] + _HALVES[:, 1]
     radius = np.where(present, flat_radius(EYES.radius, height, low, high), 0.0)  # [n, M]
     reach = np.where(radius > 0, radius + np.hypot(_HALVES[:, 0], _HALVES[:, 2]), -1.0)
+    reach[:, :_NUM_BASES] = np.maximum(reach[:, :_NUM_BASES], _COLUMN_REACH)
     centre = centre[..., ::2]
     agent, ray, box = np.nonzero(passes(origin, direction, centre[:, None], reach[:, None]))
-    distance[agent, ray, box] = cast_rectangles(
-        origin[agent, 0, 0],
-        direction[agent, ray, 0],
-        radius[agent, box],
-        centre[agent, box],
-        _HALVES[box, ::2],
-        yaw[agent, box],
-        CONTACT_GAP,
+    start, ahead, middle = origin[agent, 0, 0], direction[agent, ray, 0], centre[agent, box]
+    travel = cast_rectangles(
+        start, ahead, radius[agent, box], middle, _HALVES[box, ::2], yaw[agent, box], CONTACT_GAP
     )
-    columns = cast_spheres(origin, direction, _COLUMNS, COLUMN_RADIUS + EYES.radius, CONTACT_GAP)
-    distance[:, :, _NUM_BOXES:-2] = columns
+    column = np.flatnonzero(box < _NUM_BASES)  # round above its square base
+    shaft = cast_spheres(start[column], ahead[column], middle[column], _COLUMN_REACH, CONTACT_GAP)
+    travel[column] = np.minimum(travel[column], shaft)
+    distance[agent, ray, box] = travel
     distance[:, :, -2:] = _cast_walls(origin[:, :, 0], direction[:, :, 0])
     return EYES.encode(distance, _TAGS)
 
