@@ -230,7 +230,7 @@ class TestFailures:
         from mappo_unity.link.restarts import _pause_s
 
         assert [_pause_s(n) for n in range(5)] == [0, 0.5, 1, 2, 4]
-        assert _pause_s(50) == 30
+        assert _pause_s(50) == 10
 
     @pytest.mark.parametrize(
         ("mode", "after", "words"),

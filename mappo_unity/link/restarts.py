@@ -17,9 +17,9 @@ from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, Decisi
 from mappo_unity.config import ConfigError, EnvironmentFailure
 from mappo_unity.link.client import MakePlayer, PlayerFailure, UnityPlayer
 
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 """Pause before the second try in a row (before the first there is none), doubled with every further one."""
-STEADY_STEPS = 100
+STEADY_STEPS = 50
 """Good steps after which earlier failures no longer lengthen the pause."""
 SEED_STRIDE = 10_000_019
 """A restarted player plays on with another seed, this much further (modulo 2^31)."""

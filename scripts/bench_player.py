@@ -1,0 +1,354 @@
+#!/usr/bin/env python3
+"""Measure scenes behind mappo-player: the link, collection, a round's parts, two players, time to a return.
+
+Everything that is compared runs in turns in one process, so that ratios hold on a machine that is shared.
+Where other work slows the wall clock down, read the CPU columns: trainer and player take turns, so a machine
+with a core free for each needs the sum of both a round.
+
+    python scripts/bench_player.py [--scene 3DBall] [--areas 12] [--repeats 5] [--train] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mappo_unity.backend import make_env_function
+from mappo_unity.compose import compose_config
+from mappo_unity.config import Config, ConfigError
+from mappo_unity.link import decode, messages
+from mappo_unity.metrics import count_decisions
+from mappo_unity.player import Player, env_function
+from mappo_unity.player import main as player_main
+from mappo_unity.train import Trainer
+
+from mlagents_envs.base_env import BaseEnv  # isort: skip  # mappo_unity lets it import
+
+TICK_S = 1 / os.sysconf("SC_CLK_TCK")
+
+
+def main() -> None:
+    """Run all measurements and print them."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scene", default="3DBall")
+    parser.add_argument("--areas", type=int, default=None, help="areas of the scene; default: as in Unity")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=300, help="environment steps of one measurement")
+    parser.add_argument("--train", action="store_true", help="train to --goal, too")
+    parser.add_argument("--goal", type=float, default=95.0, help="mean return to train to")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    print(f"load average at the start: {os.getloadavg()[0]:.2f}; {os.cpu_count()} cores; one torch thread")
+    with tempfile.TemporaryDirectory() as folder:
+        player_main(["build", arguments.scene, folder])
+        build = str(Path(folder) / arguments.scene)
+        cfg = options(arguments, build)
+        link(cfg, arguments)
+        parts(cfg, arguments, Path(folder))
+        several(cfg, arguments)
+        if arguments.train:
+            train(cfg, arguments, Path(folder))
+    print(f"load average at the end: {os.getloadavg()[0]:.2f}")
+
+
+def options(arguments: argparse.Namespace, build: str, *more: str) -> Config:
+    """Return the scene's preset with its player below it."""
+    areas = [] if arguments.areas is None else [f"env.num_areas={arguments.areas}"]
+    if arguments.areas is None and arguments.scene == "3DBall":
+        areas = ["env.num_areas=12"]  # as in Unity
+    lines = [f"env={arguments.scene}", "env.backend=player", f"env.file_name={build}", *areas, *more]
+    quiet = ["log.backends=[]", "log.progress=false", "export_onnx=false", "collect.batch_size=4096"]
+    return compose_config([*lines, *quiet, f"seed={arguments.seed}"]).config
+
+
+# ---- stepping with random actions: ML-Agents' client, ours, no link at all
+
+
+def link(cfg: Config, arguments: argparse.Namespace) -> None:
+    """Compare clients: steps with random actions."""
+    from mlagents_envs.environment import UnityEnvironment
+    from mlagents_envs.exception import UnityWorkerInUseException
+
+    def mlagents() -> BaseEnv:
+        for port in range(6005, 6105):
+            try:
+                env = UnityEnvironment(
+                    cfg.env.file_name,
+                    base_port=port,
+                    seed=0,
+                    num_areas=cfg.env.num_areas or 1,
+                    no_graphics=True,
+                )
+                return env
+            except UnityWorkerInUseException:
+                continue
+        raise ConfigError("no port from 6005 to 6104 is free for UnityEnvironment")
+
+    embedded = env_function(arguments.scene, cfg.env.num_areas)
+    rows = {
+        "embedded scene": Stepping(embedded(0, None), None),
+        "mlagents_envs.UnityEnvironment": (lambda env: Stepping(env, env._process.pid))(mlagents()),
+        "mappo-unity": (lambda env: Stepping(env, env.player.process.pid))(make_env_function(cfg.env)(0)),
+    }
+    for _ in range(arguments.repeats):
+        for row in rows.values():
+            row.measure(arguments.rounds)
+    print(f"\nrandom actions in {arguments.scene}: {arguments.repeats} times {arguments.rounds} steps")
+    print(f"{'':34s}{'agent steps/s':>15s}{'us a step':>12s}{'trainer CPU':>13s}{'player CPU':>12s}")
+    for name, row in rows.items():
+        print(f"{name:34s}{row.line()}")
+    bare, ours = rows["mlagents_envs.UnityEnvironment"], rows["mappo-unity"]
+    print(f"our client against ML-Agents': {median_ratio(bare.wall_us, ours.wall_us):.2f} times as fast")
+    for row in rows.values():
+        row.env.close()
+
+
+class Stepping:
+    """Step an environment with random actions, again and again."""
+
+    def __init__(self, env: BaseEnv, pid: int | None) -> None:
+        self.env, self.pid = env, pid
+        self.wall_us: list[float] = []
+        self.cpu_us: list[float] = []
+        self.player_us: list[float] = []
+        self.agents_per_step: list[float] = []
+        self.rng = np.random.default_rng(0)
+        env.reset()
+
+    def measure(self, steps: int) -> None:
+        """Take one measurement more."""
+        wall, cpu, player, agents = time.perf_counter(), time.process_time(), self._player_s(), 0
+        for _ in range(steps):
+            agents += self._step()
+        self.wall_us.append((time.perf_counter() - wall) / steps * 1e6)
+        self.cpu_us.append((time.process_time() - cpu) / steps * 1e6)
+        self.player_us.append((self._player_s() - player) / steps * 1e6)
+        self.agents_per_step.append(agents / steps)
+
+    def _step(self) -> int:
+        agents = 0
+        for name, spec in self.env.behavior_specs.items():
+            count = len(self.env.get_steps(name)[0])
+            if count:
+                self.env.set_actions(name, spec.action_spec.random_action(count))
+            agents += count
+        self.env.step()
+        return agents
+
+    def _player_s(self) -> float:
+        return cpu_s(self.pid) if self.pid is not None else 0.0
+
+    def line(self) -> str:
+        """Return medians as columns."""
+        rates = [a / w * 1e6 for a, w in zip(self.agents_per_step, self.wall_us)]
+        return (
+            f"{statistics.median(rates):15,.0f}{statistics.median(self.wall_us):12.0f}"
+            f"{statistics.median(self.cpu_us):13.0f}{statistics.median(self.player_us):12.0f}"
+        )
+
+
+# ---- one round of training's collection, part by part
+
+
+def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
+    """Print what a round costs in player, transport, decoding, adapter and policy, CPU microseconds."""
+    trainer = Trainer(cfg, folder / "parts")
+    pid = trainer.env.base_env.player.process.pid
+    batches = iter(trainer.make_collector())
+    next(batches)
+    whole: list[tuple[float, float, float, float]] = []
+    for _ in range(arguments.repeats):
+        wall, cpu, player = time.perf_counter(), time.process_time(), cpu_s(pid)
+        batch = next(batches)
+        rounds = batch.shape[0]
+        whole.append(
+            (
+                (time.perf_counter() - wall) / rounds * 1e6,
+                (time.process_time() - cpu) / rounds * 1e6,
+                (cpu_s(pid) - player) / rounds * 1e6,
+                count_decisions(batch, list(trainer.learners)) / rounds,
+            )
+        )
+    wall_us, cpu_us, player_us, agents = (statistics.median(column) for column in zip(*whole))
+    data, output_us = player_message(arguments.scene, cfg, arguments.rounds)
+    decode_us = decoding(data, arguments.rounds)
+    policy_us = policy(trainer, arguments.rounds)
+    adapter_us = adapter(cfg, arguments)
+    print(f"\na round of collecting {arguments.scene}: {agents:.1f} agents act, {wall_us:.0f} us")
+    print(f"  end to end                {agents / wall_us * 1e6:10,.0f} agent steps/s")
+    print(
+        f"  with a core for each      {agents / (cpu_us + player_us) * 1e6:10,.0f} agent steps/s (sum of CPU)"
+    )
+    print(
+        f"  player process            {player_us:10.0f} us CPU (scene and its messages alone {output_us:.0f})"
+    )
+    print(f"  decoding a message        {decode_us:10.0f} us CPU ({len(data):,} bytes)")
+    print(f"  adapter                   {adapter_us:10.0f} us CPU (UnityEnv.step less the BaseEnv's)")
+    print(f"  policy                    {policy_us:10.0f} us CPU")
+    rest = cpu_us - decode_us - adapter_us - policy_us
+    print(f"  transport and collector   {rest:10.0f} us CPU (what remains of the trainer's {cpu_us:.0f})")
+    trainer.close()
+
+
+def player_message(scene: str, cfg: Config, steps: int) -> tuple[bytes, float]:
+    """Return a player's message, and what the player spends on one, without gRPC (CPU us)."""
+    player = Player(env_function(scene, cfg.env.num_areas), scene)
+    hello = messages.parse(messages.message(200, unity_input=decode.initialization(0, 1, "0.28.0")))
+    player._open(hello.unity_input.rl_initialization_input)
+    reset = messages.parse(messages.message(200, unity_input=decode.rl_input({}, messages.RESET, b"")))
+    data = messages.message(200, unity_output=player.advance(reset.unity_input.rl_input))
+    step = messages.parse(messages.message(200, unity_input=decode.rl_input({}, messages.STEP, b"")))
+    begin = time.process_time()
+    for _ in range(steps):
+        messages.message(200, unity_output=player.advance(step.unity_input.rl_input))
+    return data, (time.process_time() - begin) / steps * 1e6
+
+
+def decoding(data: bytes, steps: int) -> float:
+    """Return what decoding a message costs, CPU us."""
+    output = messages.parse(data).unity_output
+    decoders = {
+        brain.brain_name: decode.BehaviorDecoder(
+            brain.brain_name,
+            decode.behavior_spec(brain, output.rl_output.agentInfos[brain.brain_name].value[0]),
+        )
+        for brain in output.rl_initialization_output.brain_parameters
+    }
+
+    def once() -> None:
+        infos = messages.parse(data).unity_output.rl_output.agentInfos
+        for name, decoder in decoders.items():
+            decoder.decode(infos[name].value)
+
+    return cpu_of(once, steps)
+
+
+def policy(trainer: Trainer, steps: int) -> float:
+    """Return what the policy costs a round, CPU us."""
+    from mappo_unity.transforms import transformed
+
+    observations = transformed(trainer.env).reset()
+    with torch.no_grad():
+        return cpu_of(lambda: trainer.policy(observations.clone(recurse=False)), steps)
+
+
+def adapter(cfg: Config, arguments: argparse.Namespace) -> float:
+    """Return what the adapter adds to a step, CPU us: embedded, with and without it."""
+    from mappo_unity.unity_env import UnityEnv
+
+    make = env_function(arguments.scene, cfg.env.num_areas)
+    env = UnityEnv(lambda seed: make(seed, None))
+    bare = Stepping(make(0, None), None)
+    actions = env.reset()
+    env.rand_action(actions)
+    state = {"actions": actions, "calls": 0}
+
+    def once() -> None:
+        env.step(state["actions"])
+
+    calls = count_calls(env.base_env)
+    with_adapter = cpu_of(once, arguments.rounds)
+    base_steps = calls() / (arguments.rounds + 10)
+    for _ in range(arguments.repeats):
+        bare.measure(arguments.rounds)
+    return with_adapter - statistics.median(bare.cpu_us) * base_steps
+
+
+def count_calls(env: Any) -> Callable[[], int]:
+    """Count an environment's steps from now on; return a function that tells their number."""
+    step, count = env.step, 0
+
+    def counted() -> None:
+        nonlocal count
+        count += 1
+        step()
+
+    env.step = counted
+    return lambda: count
+
+
+# ---- two players, and training
+
+
+def several(cfg: Config, arguments: argparse.Namespace) -> None:
+    """Print what a second player brings."""
+    rows = {}
+    for count in (1, 2):
+        cfg.env.num_players = count
+        rows[count] = Stepping(make_env_function(cfg.env)(0), None)
+    cfg.env.num_players = 1
+    for _ in range(arguments.repeats):
+        for row in rows.values():
+            row.measure(arguments.rounds)
+    rates = {n: [a / w for a, w in zip(r.agents_per_step, r.wall_us)] for n, r in rows.items()}
+    costs = {n: [w / a for a, w in zip(r.agents_per_step, r.cpu_us)] for n, r in rows.items()}
+    print(
+        f"\ntwo players against one: {median_ratio(rates[2], rates[1]):.2f} times the agent steps/s; "
+        f"trainer's CPU an agent step {median_ratio(costs[2], costs[1]):.2f} times"
+    )
+    for row in rows.values():
+        row.env.close()
+
+
+def train(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
+    """Train until the mean return over a full window reaches the goal."""
+    trainer = Trainer(cfg, folder / "train")
+    pid = trainer.env.base_env.player.process.pid
+    batches = iter(trainer.make_collector())
+    wall, cpu, player = time.perf_counter(), time.process_time(), cpu_s(pid)
+    while trainer.agent_steps < cfg.max_steps:
+        trainer.iterate(batches)
+        if trainer.window.full and trainer.window.summary()["return_mean"] >= arguments.goal:
+            break
+    wall_s, cpu_used = time.perf_counter() - wall, time.process_time() - cpu
+    player_used = cpu_s(pid) - player
+    print(
+        "\ntraining with the preset's options to a mean return of "
+        f"{trainer.window.summary()['return_mean']:.1f}: {trainer.agent_steps:,} agent steps, "
+        f"{wall_s:.1f} s, {trainer.agent_steps / wall_s:,.0f} agent steps/s"
+    )
+    print(
+        f"  CPU: trainer {cpu_used:.1f} s, player {player_used:.1f} s: "
+        f"{trainer.agent_steps / (cpu_used + player_used):,.0f} agent steps/s with a core for each"
+    )
+    trainer.close()
+
+
+def cpu_of(call: Callable[[], Any], times: int) -> float:
+    """Return a call's CPU microseconds, after ten calls to warm up."""
+    for _ in range(10):
+        call()
+    begin = time.process_time()
+    for _ in range(times):
+        call()
+    return (time.process_time() - begin) / times * 1e6
+
+
+def cpu_s(pid: int) -> float:
+    """Return the CPU seconds of another process (Linux; 0 elsewhere), to 10 ms."""
+    stat = Path(f"/proc/{pid}/stat")
+    if not stat.exists():
+        return 0.0
+    fields = stat.read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * TICK_S
+
+
+def median_ratio(above: list[float], below: list[float]) -> float:
+    """Return the median of the ratios of measurements taken in turns."""
+    return statistics.median(a / b for a, b in zip(above, below))
+
+
+if __name__ == "__main__":
+    main()
