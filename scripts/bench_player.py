@@ -78,29 +78,11 @@ def options(arguments: argparse.Namespace, build: str, *more: str) -> Config:
 
 def link(cfg: Config, arguments: argparse.Namespace) -> None:
     """Compare clients: steps with random actions."""
-    from mlagents_envs.environment import UnityEnvironment
-    from mlagents_envs.exception import UnityWorkerInUseException
-
-    def mlagents() -> BaseEnv:
-        for port in range(6005, 6105):
-            try:
-                env = UnityEnvironment(
-                    cfg.env.file_name,
-                    base_port=port,
-                    seed=0,
-                    num_areas=cfg.env.num_areas or 1,
-                    no_graphics=True,
-                )
-                return env
-            except UnityWorkerInUseException:
-                continue
-        raise ConfigError("no port from 6005 to 6104 is free for UnityEnvironment")
-
     embedded = env_function(arguments.scene, cfg.env.num_areas)
     rows = {
         "embedded scene": Stepping(embedded(0, None), None),
-        "mlagents_envs.UnityEnvironment": (lambda env: Stepping(env, env._process.pid))(mlagents()),
-        "mappo-unity": (lambda env: Stepping(env, env.player.process.pid))(make_env_function(cfg.env)(0)),
+        "mlagents_envs.UnityEnvironment": mlagents_client(cfg),
+        "mappo-unity": our_client(cfg),
     }
     for _ in range(arguments.repeats):
         for row in rows.values():
@@ -113,6 +95,27 @@ def link(cfg: Config, arguments: argparse.Namespace) -> None:
     print(f"our client against ML-Agents': {median_ratio(bare.wall_us, ours.wall_us):.2f} times as fast")
     for row in rows.values():
         row.env.close()
+
+
+def mlagents_client(cfg: Config) -> Stepping:
+    """Return ML-Agents' own client on the same player, on the first port that is free."""
+    from mlagents_envs.environment import UnityEnvironment
+    from mlagents_envs.exception import UnityWorkerInUseException
+
+    areas = cfg.env.num_areas or 1
+    for port in range(6005, 6105):
+        try:
+            env = UnityEnvironment(cfg.env.file_name, base_port=port, num_areas=areas, no_graphics=True)
+        except UnityWorkerInUseException:
+            continue
+        return Stepping(env, env._process.pid)
+    raise ConfigError("no port from 6005 to 6104 is free for UnityEnvironment")
+
+
+def our_client(cfg: Config) -> Stepping:
+    """Return the client of this project on the same player."""
+    env: Any = make_env_function(cfg.env)(0)
+    return Stepping(env, env.player.process.pid)
 
 
 class Stepping:
@@ -165,11 +168,14 @@ class Stepping:
 def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
     """Print what a round costs in player, transport, decoding, adapter and policy, CPU microseconds."""
     trainer = Trainer(cfg, folder / "parts")
-    pid = trainer.env.base_env.player.process.pid
+    base_env: Any = trainer.env.base_env
+    pid = base_env.player.process.pid
+    bare = mlagents_client(cfg)
     batches = iter(trainer.make_collector())
     next(batches)
     whole: list[tuple[float, float, float, float]] = []
     for _ in range(arguments.repeats):
+        bare.measure(arguments.rounds)
         wall, cpu, player = time.perf_counter(), time.process_time(), cpu_s(pid)
         batch = next(batches)
         rounds = batch.shape[0]
@@ -181,6 +187,8 @@ def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
                 count_decisions(batch, list(trainer.learners)) / rounds,
             )
         )
+    bare_rates = [a / w for a, w in zip(bare.agents_per_step, bare.wall_us)]
+    rates = [agents / wall_us for wall_us, _, _, agents in whole]
     wall_us, cpu_us, player_us, agents = (statistics.median(column) for column in zip(*whole))
     data, output_us = player_message(arguments.scene, cfg, arguments.rounds)
     decode_us = decoding(data, arguments.rounds)
@@ -188,6 +196,7 @@ def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
     adapter_us = adapter(cfg, arguments)
     print(f"\na round of collecting {arguments.scene}: {agents:.1f} agents act, {wall_us:.0f} us")
     print(f"  end to end                {agents / wall_us * 1e6:10,.0f} agent steps/s")
+    print(f"  against bare stepping     {median_ratio(rates, bare_rates):10.2f} of ML-Agents' agent steps/s")
     print(
         f"  with a core for each      {agents / (cpu_us + player_us) * 1e6:10,.0f} agent steps/s (sum of CPU)"
     )
@@ -195,10 +204,11 @@ def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
         f"  player process            {player_us:10.0f} us CPU (scene and its messages alone {output_us:.0f})"
     )
     print(f"  decoding a message        {decode_us:10.0f} us CPU ({len(data):,} bytes)")
-    print(f"  adapter                   {adapter_us:10.0f} us CPU (UnityEnv.step less the BaseEnv's)")
+    print(f"  adapter                   {adapter_us:10.0f} us CPU (UnityEnv.step less the scene's)")
     print(f"  policy                    {policy_us:10.0f} us CPU")
     rest = cpu_us - decode_us - adapter_us - policy_us
     print(f"  transport and collector   {rest:10.0f} us CPU (what remains of the trainer's {cpu_us:.0f})")
+    bare.env.close()
     trainer.close()
 
 
@@ -245,38 +255,32 @@ def policy(trainer: Trainer, steps: int) -> float:
 
 
 def adapter(cfg: Config, arguments: argparse.Namespace) -> float:
-    """Return what the adapter adds to a step, CPU us: embedded, with and without it."""
+    """Return what the adapter adds to a round, CPU us: embedded, less the scene's own steps."""
     from mappo_unity.unity_env import UnityEnv
 
     make = env_function(arguments.scene, cfg.env.num_areas)
     env = UnityEnv(lambda seed: make(seed, None))
-    bare = Stepping(make(0, None), None)
-    actions = env.reset()
-    env.rand_action(actions)
-    state = {"actions": actions, "calls": 0}
-
-    def once() -> None:
-        env.step(state["actions"])
-
-    calls = count_calls(env.base_env)
-    with_adapter = cpu_of(once, arguments.rounds)
-    base_steps = calls() / (arguments.rounds + 10)
-    for _ in range(arguments.repeats):
-        bare.measure(arguments.rounds)
-    return with_adapter - statistics.median(bare.cpu_us) * base_steps
+    tensordict = env.rand_action(env.reset())
+    inner_s = timed_steps(env.base_env)
+    begin, inner = time.process_time(), inner_s()
+    for _ in range(arguments.rounds):
+        env.step(tensordict)
+    own = time.process_time() - begin - (inner_s() - inner)
+    return own / arguments.rounds * 1e6
 
 
-def count_calls(env: Any) -> Callable[[], int]:
-    """Count an environment's steps from now on; return a function that tells their number."""
-    step, count = env.step, 0
+def timed_steps(env: Any) -> Callable[[], float]:
+    """Sum up the CPU seconds of an environment's steps from now on; return a function that tells the sum."""
+    step, total = env.step, 0.0
 
-    def counted() -> None:
-        nonlocal count
-        count += 1
+    def timed() -> None:
+        nonlocal total
+        begin = time.process_time()
         step()
+        total += time.process_time() - begin
 
-    env.step = counted
-    return lambda: count
+    env.step = timed
+    return lambda: total
 
 
 # ---- two players, and training
