@@ -34,6 +34,7 @@ def play(
     for _ in range(MAX_ENV_STEPS):
         for name in env.behavior_specs:
             decision, terminal = env.get_steps(name)
+            _drop_cut_off(env, name, running, counts)
             _end_episodes(name, terminal, running, counts)
             actor = policy[name] if isinstance(policy, dict) else policy
             if isinstance(
@@ -63,6 +64,14 @@ class _Counts:
 
     def complete(self, names: list[str]) -> bool:
         return all(len(self.ended.get(name, [])) >= self.wanted for name in names)
+
+
+def _drop_cut_off(env: BaseEnv, name: str, running: dict, counts: _Counts) -> None:
+    """Forget the episodes that a failed player took along (see `link.restarts`); others are begun instead."""
+    for agent in getattr(env, "cut_off", {}).get(name, ()):
+        episode = running.pop((name, int(agent)), None)
+        if episode is not None and episode[0]:
+            counts.begun[name] -= 1
 
 
 def _end_episodes(name: str, terminal: Any, running: dict, counts: _Counts) -> None:

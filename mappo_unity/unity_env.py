@@ -141,6 +141,8 @@ class UnityEnv(EnvBase):
         self._untouched = False
         self._play_until_asked()
         self._note_cut_off()
+        if self.restarts is not None:
+            self._check_behaviors()
         self.rounds += 1
         return TensorDict({self.entry_of[name]: self._next(b) for name, b in self._behaviors.items()}, [])
 
@@ -192,6 +194,15 @@ class UnityEnv(EnvBase):
             )
         for behavior in self._behaviors.values():
             behavior.end_round()
+
+    def _check_behaviors(self) -> None:
+        """Refuse behaviors that a player shows after the start: their agents would never act."""
+        late = [name for name in self.base_env.behavior_specs if name not in self._behaviors]
+        if late:
+            raise ConfigError(
+                f"behavior {late[0]!r} appeared after the start, when there were {list(self._behaviors)}: "
+                "its networks cannot be made any more; let every behavior have an active agent at first"
+            )
 
     def _note_cut_off(self) -> None:
         for name, behavior in self._behaviors.items():

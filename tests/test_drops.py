@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
-from fakes import Record, ScriptedEnv
+from fakes import Record, ScriptedEnv, behavior_spec
 
 from mappo_unity import checkpoint
 from mappo_unity.cli import train_main
 from mappo_unity.collect import make_collector
-from mappo_unity.config import EnvironmentFailure
+from mappo_unity.config import ConfigError, EnvironmentFailure
 from mappo_unity.drops import drop_episodes, episode_rows
+from mappo_unity.episodes import play
+from mappo_unity.policies import RandomPolicy
 from mappo_unity.scenes import make_scene
 from mappo_unity.unity_env import UnityEnv
 
@@ -80,6 +83,28 @@ def test_a_cut_episode_neither_counts_nor_is_learned_from() -> None:
         [True, False, False, True, True],
         [False, False, False, True, True],
     ]
+
+
+def test_evaluation_plays_another_episode_for_one_that_was_cut_off() -> None:
+    env = Fragile(
+        [
+            [Record(0), Record(1)],
+            [Record(0, reward=1), Record(1, reward=1)],
+            [Record(0, ends="interrupted"), Record(1, ends="interrupted"), Record(0), Record(1)],
+            [Record(0, ends="terminated", reward=3), Record(0), Record(1, reward=1)],
+            [Record(0), Record(1, ends="terminated", reward=4), Record(1)],
+        ]
+    )
+    env.breaks_at, env.cut = 2, (0, 1)
+    episodes = play(env, RandomPolicy(0), 2)[FAKE]
+    assert [(e.agent_id, e.individual_return, e.length) for e in episodes] == [(0, 3, 1), (1, 5, 2)]
+
+
+def test_a_behavior_that_a_player_shows_late_is_refused() -> None:
+    env = fragile([[Record(0)]] * 5, 99, ())
+    env.base_env.specs["Late?team=0"] = behavior_spec()
+    with pytest.raises(ConfigError, match="'Late.team=0' appeared after the start, when there were .'Fake"):
+        idle(env, 1)
 
 
 def test_an_environment_without_players_has_no_restarts() -> None:
