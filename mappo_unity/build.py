@@ -44,8 +44,8 @@ def make_unity_env(cfg: Config, folder: Path) -> UnityEnv:
 
 
 def batch_rounds(cfg: Config, env: UnityEnv) -> int:
-    """Return the rounds of a batch."""
-    return num_rounds(cfg.collect, sum(len(behavior.acting) for behavior in env.behaviors.values()))
+    """Return the rounds of a batch, for the agents that the environment began with."""
+    return num_rounds(cfg.collect, sum(int(behavior.present.sum()) for behavior in env.behaviors.values()))
 
 
 def make_learners(cfg: Config, env: UnityEnv) -> dict[str, PolicyLearner]:
@@ -62,8 +62,8 @@ def make_learners(cfg: Config, env: UnityEnv) -> dict[str, PolicyLearner]:
             option = "ppo.minibatch_size" if ppo.num_minibatches is None else "ppo.num_minibatches"
             raise ConfigError(
                 f"{option}={getattr(ppo, option[4:])} is larger than the batch of {name!r}: "
-                f"collect.rounds={rounds} x {agents} agents = {rows * team_size} decisions; "
-                f"lower {option} or raise collect.rounds or env.num_areas"
+                f"{rounds} rounds x {agents} agents = {rows * team_size} decisions; "
+                f"lower {option}, or raise collect.batch_size (or collect.rounds, where it is given)"
             )
         obs = ObsLayout.from_specs(behavior.spec.observation_specs)
         layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)

@@ -13,8 +13,8 @@ from mappo_unity.models import JointPolicy
 
 
 def num_rounds(cfg: CollectConfig, agents: int) -> int:
-    """Return the rounds of a batch for an environment with so many agent slots."""
-    return cfg.rounds if cfg.batch_size is None else -(-cfg.batch_size // agents)
+    """Return the rounds of a batch for an environment in which so many agents act."""
+    return -(-cfg.batch_size // max(1, agents)) if cfg.rounds is None else cfg.rounds
 
 
 def make_collector(env: EnvBase, policy: JointPolicy, rounds: int, device: str = "cpu") -> Collector:

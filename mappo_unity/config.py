@@ -311,15 +311,14 @@ class PPOConfig:
 class CollectConfig:
     """Collecting experience."""
 
-    rounds: int = 64
-    """Rounds (environment steps) in a batch; a batch holds rounds x agents decisions."""
-    batch_size: Optional[int] = None
-    """Agent decisions in a batch at least, instead of collect.rounds (ML-Agents' buffer_size); null: as
-    collect.rounds says."""
+    batch_size: int = 8192
+    """Agent decisions in a batch at least (ML-Agents' buffer_size)."""
+    rounds: Optional[int] = None
+    """Rounds (environment steps) in a batch, instead of collect.batch_size: rounds x agents decisions."""
 
     def __post_init__(self) -> None:
-        _at_least("collect.rounds", self.rounds, 1)
         _at_least("collect.batch_size", self.batch_size, 1)
+        _at_least("collect.rounds", self.rounds, 1)
 
 
 @dataclass

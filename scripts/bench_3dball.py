@@ -21,6 +21,7 @@ import torch
 from mlagents_envs.base_env import ActionTuple
 from torch import nn
 
+from mappo_unity.build import batch_rounds
 from mappo_unity.compose import compose_config
 from mappo_unity.config import Config
 from mappo_unity.layers import make_mlp
@@ -44,7 +45,7 @@ def main() -> None:
     ).config
     print(
         f"load average at the start: {os.getloadavg()[0]:.2f}; {os.cpu_count()} cores; "
-        f"torch threads {cfg.num_threads}; {cfg.env.num_areas} areas, {cfg.collect.rounds} rounds, "
+        f"torch threads {cfg.num_threads}; {cfg.env.num_areas} areas, batch {cfg.collect.batch_size}, "
         f"hidden {list(cfg.model.hidden)}, minibatch {cfg.ppo.minibatch_size}"
     )
     time_to_95(cfg)
@@ -88,15 +89,16 @@ def collection(cfg: Config, repeats: int) -> None:
     """Compare the collector with a bare loop: scene step and forward pass of the same network."""
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(cfg, Path(folder))
+        rounds = batch_rounds(cfg, trainer.env)
         batches = iter(trainer.make_collector())
         bare = BareLoop(cfg)
-        next(batches), bare.collect(cfg.collect.rounds)
+        next(batches), bare.collect(rounds)
         ours, theirs, ratios = [], [], []
         for _ in range(repeats):
             ours.append(timed(lambda: [next(batches) for _ in range(4)]))
-            theirs.append(timed(lambda: bare.collect(4 * cfg.collect.rounds)))
+            theirs.append(timed(lambda: bare.collect(4 * rounds)))
             ratios.append(theirs[-1] / ours[-1])
-        steps = 4 * cfg.collect.rounds * int(cfg.env.num_areas or 12)
+        steps = 4 * rounds * int(cfg.env.num_areas or 12)
         print(
             f"collection: {steps / statistics.median(ours):,.0f} agent steps/s; bare loop "
             f"{steps / statistics.median(theirs):,.0f}/s; ratio {statistics.median(ratios):.2f} "
