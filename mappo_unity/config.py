@@ -339,8 +339,8 @@ class MatchConfig:
 class LogConfig:
     """Metrics and progress."""
 
-    backends: list[LogBackend] = field(default_factory=lambda: [LogBackend.csv, LogBackend.tensorboard])
-    """Any of csv, tensorboard, wandb, mlflow; metrics.csv is always written."""
+    backends: list[LogBackend] = field(default_factory=lambda: [LogBackend.tensorboard])
+    """Any of tensorboard, wandb, mlflow, csv (a file for each metric); metrics.csv is always written."""
     project: str = "mappo-unity"
     """Project (wandb) or experiment (mlflow) that the run is filed under."""
     return_window: int = 100
