@@ -5,7 +5,7 @@
     python scripts/compare.py env=SoccerTwos --seconds 300 --matches 200 -- default model.critic=local
 
 A variant is a list of overrides joined by '+' ("default" is none). Where an environment has two sides,
-the end of a run plays matches against a random side.
+matches against a random side are played before and after.
 """
 
 from __future__ import annotations
@@ -59,8 +59,9 @@ def run(arguments: argparse.Namespace, variant: str, seed: int) -> str:
     with tempfile.TemporaryDirectory() as folder:
         trainer = BudgetTrainer(cfg, Path(folder))
         trainer.seconds = arguments.seconds
+        before = play(trainer, arguments.matches) if arguments.matches else "-"
         outcome = trainer.run()
-        matches = play(trainer, arguments.matches) if arguments.matches else "-"
+        matches = f"{before} -> {play(trainer, arguments.matches)}" if arguments.matches else "-"
         trainer.close()
         with open(Path(folder) / "metrics.csv", newline="") as file:
             rows = list(csv.DictReader(file))
@@ -91,9 +92,9 @@ def play(trainer: Trainer, count: int) -> str:
     player = ActorPolicy(describe_policies(trainer.env), actors, False, "the policy")
     scores = play_matches(make_env_function(trainer.cfg.env), player, RandomPolicy(1), count, seed=1)
     figures = match_figures(scores)
-    return (
-        f"{100 * figures['won_of_decided']:.1f} % of {figures['wins'] + figures['losses']} decided, "
-        f"{figures['draws']} draws"
+    return "; ".join(
+        f"{name}: {side['wins']} won {side['losses']} lost {side['draws']} drawn"
+        for name, side in figures["as"].items()
     )
 
 
