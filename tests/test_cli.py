@@ -124,7 +124,7 @@ def test_a_run_leaves_its_record(training: FakeTraining, capsys: pytest.CaptureF
     config, given_folder, checkpoint = training.calls[0]
     assert (config.seed, config.ppo.lr, given_folder, checkpoint) == (4, 1e-3, folder, None)
     saved = yaml.safe_load((folder / "config.yaml").read_text())
-    assert saved["ppo"]["lr"] == 1e-3 and saved["log"]["backends"] == ["csv", "tensorboard"]
+    assert saved["ppo"]["lr"] == 1e-3 and saved["log"]["backends"] == ["tensorboard"]
     assert set(saved) == set(vars(Config()))
     assert yaml.safe_load((folder / "overrides.yaml").read_text())[0]["overrides"] == [
         "seed=4",
