@@ -10,6 +10,7 @@ tensors and plain values are ever unpickled.
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import zipfile
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mappo_unity.atomic import write_atomically
 from mappo_unity.config import ConfigError
 
 FORMAT = 1
@@ -38,17 +40,13 @@ def save(path: Path, state: dict[str, Any]) -> None:
     Raises:
         CheckpointError: the disk is full or the folder cannot be written; a previous file stays.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "wb") as file:
-            torch.save(_to_tensors({"format": FORMAT} | state), file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        content = io.BytesIO()
+        torch.save(_to_tensors({"format": FORMAT} | state), content)
+        write_atomically(path, content.getvalue())
         _sync_folder(path.parent)
     except (OSError, RuntimeError) as error:
-        temporary.unlink(missing_ok=True)
         raise CheckpointError(
             f"checkpoint {path} could not be written: {error}; the checkpoints before it stay as they are. "
             "Free some space or choose another output_dir, then continue with resume="

@@ -85,6 +85,7 @@ class Trainer:
         self.last_checkpoint: Path | None = None
         self.stop_signal: int | None = None
         self.resumed = False
+        self._rng_state: dict[str, Any] | None = None  # of the checkpoint that is continued
         self.log: RunLog | None = None
         self.samples: dict[str, dict[str, torch.Tensor]] = {}  # what an export is compared on
         self.exports: RunExports | None = None
@@ -99,9 +100,8 @@ class Trainer:
             self.exports = RunExports(self.folder, self.log.message)
         collector = self.make_collector()
         handlers = {s: signal.signal(s, self._on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
-        rng_state = getattr(self, "_rng_state", None)
-        if rng_state is not None:
-            set_rng_state(rng_state)
+        if self._rng_state is not None:
+            set_rng_state(self._rng_state)
         try:
             batches = iter(collector)
             status = self._status()

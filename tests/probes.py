@@ -258,7 +258,6 @@ class EarlyDeath(Probe):
         return self.clock >= 3, np.zeros(self.teams, bool)
 
     def _terminals(self, over, cut):
-        out = super()._terminals(over, cut)
         first_over = self.clock == 1
         member = np.zeros((self.teams, 2), bool)
         member[first_over, 0] = True
@@ -268,7 +267,6 @@ class EarlyDeath(Probe):
         obs = self.observe().reshape(self.count, -1)[rows].astype(np.float32)
         zeros = np.zeros(len(rows), np.float32)
         interrupted = np.zeros(len(rows), bool)
-        del out
         return TerminalSteps(
             [obs],
             zeros,
