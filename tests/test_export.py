@@ -267,19 +267,24 @@ def test_mappo_eval_plays_an_onnx_file_as_its_checkpoint(tiny_run, tmp_path, cap
 @pytest.mark.slow
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_run_policy_earns_what_mappo_eval_says(shared, tmp_path, deterministic):
-    """A half-trained 3DBall policy (a perfect one hides differences), within two standard errors."""
+    """A half-trained 3DBall policy (a perfect one hides differences), within four standard errors.
+
+    Two would fail one honest run in ten (four comparisons); the many episodes keep four of them narrow, and the
+    share of episodes that run_policy leaves unfinished, the longer ones, small.
+    """
+    episodes = 800
     lines = ["env=3DBall", "max_steps=40000", "log.backends=[]", "log.progress=false"]
     cfg = compose_config(lines).config
     write_record(tmp_path, cfg, lines)
     train(cfg, tmp_path)
     path = tmp_path / "checkpoints" / "final.onnx"
-    found = evaluate(checkpoint.checkpoints_in(tmp_path)[-1], 240, deterministic, seed=1)
-    played = evaluate(path, 240, deterministic, seed=2, env="3DBall")
+    found = evaluate(checkpoint.checkpoints_in(tmp_path)[-1], episodes, deterministic, seed=1)
+    played = evaluate(path, episodes, deterministic, seed=2, env="3DBall")
     env = make_scene("3DBall", seed=3)
     policies = {"3DBall": official_policy(shared, path, deterministic)}
-    done = run_policy(shared).play(env, policies, 240, 200_000)["3DBall?team=0"]
+    done = run_policy(shared).play(env, policies, episodes, 200_000)["3DBall?team=0"]
     env.close()
     returns = np.array([row[0] for row in done])
     error = returns.std() / len(returns) ** 0.5
     for mean, stderr in ((played["mean_return"], played["stderr"]), (returns.mean(), error)):
-        assert abs(mean - found["mean_return"]) <= 2 * math.hypot(stderr, found["stderr"]) + 1e-3
+        assert abs(mean - found["mean_return"]) <= 4 * math.hypot(stderr, found["stderr"]) + 1e-3
