@@ -128,7 +128,8 @@ class UnityEnv(EnvBase):
     # --- EnvBase
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if tensordict is None or not any(k in tensordict.keys(True) for k in self.reset_keys):
+        # of two sides, Stack asks for ("SoccerTwos", "_reset"), which is not one of `reset_keys`
+        if tensordict is None or not any("_reset" in key for key in tensordict.keys(True)):
             self._full_reset()
         return self._root()
 

@@ -269,8 +269,8 @@ def test_mappo_eval_plays_an_onnx_file_as_its_checkpoint(tiny_run, tmp_path, cap
 def test_run_policy_earns_what_mappo_eval_says(shared, tmp_path, deterministic):
     """A half-trained 3DBall policy (a perfect one hides differences), within four standard errors.
 
-    Two would fail one honest run in ten (four comparisons); the many episodes keep four of them narrow, and the
-    share of episodes that run_policy leaves unfinished, the longer ones, small.
+    Two would fail one honest run in ten (four comparisons); the many episodes keep four of them narrow, and
+    the share of episodes that run_policy leaves unfinished, the longer ones, small.
     """
     episodes = 800
     lines = ["env=3DBall", "max_steps=40000", "log.backends=[]", "log.progress=false"]

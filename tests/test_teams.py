@@ -35,6 +35,26 @@ def test_sides_are_stacked_and_actions_find_their_side():
     assert [(name, a.item()) for name, a, _ in base.actions] == [(names[0], 0.25), (names[1], -0.5)]
 
 
+def test_one_side_s_end_resets_no_scene_and_leaves_the_other_side_s_episode_alone():
+    names = ("Soccer?team=1", "Soccer?team=0")
+    ends = [R(0, ends="terminated", reward=5, behavior=names[0]), R(0, behavior=names[0])]
+    asked = [R(0, behavior=names[0]), R(1, reward=1, behavior=names[1])]
+    script = [
+        asked,
+        [*ends, asked[1]],
+        asked,
+        [*ends, R(1, ends="terminated", reward=1, behavior=names[1]), asked[1]],
+    ]
+    base = ScriptedEnv(script, {name: behavior_spec() for name in names})
+    plain = UnityEnv(lambda seed: base)
+    rows = transformed(plain).rollout(3, break_when_any_done=False)
+    assert base.resets == 1
+    assert rows["next", "Soccer", "done"].flatten(1).tolist() == [[True, False], [False, False], [True, True]]
+    finished = plain.pop_episodes()
+    assert [episode.length for episode in finished[names[0]]] == [1, 2]
+    assert [(episode.length, episode.individual_return) for episode in finished[names[1]]] == [(3, 4.0)]
+
+
 def test_soccer_s_shapes_through_the_transforms():
     env = transformed(soccer())
     check_env_specs(env, seed=0)
