@@ -105,7 +105,8 @@ class ActionDistribution(Distribution):
         logits = params[..., 2 * size :]
         if mask is not None and layout.branches:
             logits = logits.masked_fill(~layout.joint_mask(mask), torch.finfo(logits.dtype).min / 4)
-        self.log_probs = [part.log_softmax(-1) for part in logits.split(list(layout.categoricals), -1)]
+        parts = logits.split(list(layout.categoricals), -1) if layout.branches else []
+        self.log_probs = [part.log_softmax(-1) for part in parts]
         super().__init__(params.shape[:-1], torch.Size([size + len(layout.branches)]), validate_args=False)
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:

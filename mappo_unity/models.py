@@ -6,10 +6,13 @@ In: layouts read from the environment, `ModelConfig`. Out: TensorDict modules th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import InteractionType, TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
@@ -68,24 +71,50 @@ class PerMember(nn.Module):
         return torch.stack(columns, -2)
 
 
-def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig) -> ProbabilisticActor:
+class UnityActor(ProbabilisticActor):
+    """The policy of one policy name as a TorchRL actor, which can also be asked for draws alone.
+
+    Args:
+        net: observation entries to the parameters ``[..., P]`` of an `ActionDistribution`.
+        obs_keys: the entries that it reads, in its order.
+        layout: the sizes of an action.
+    """
+
+    def __init__(self, net: nn.Module, obs_keys: Sequence[str], layout: ActionLayout) -> None:
+        in_keys = {"params": "params"} | ({"mask": keys.MASK} if layout.branches else {})
+        super().__init__(
+            TensorDictModule(net, in_keys=list(obs_keys), out_keys=["params"]),
+            in_keys=in_keys,
+            out_keys=[keys.ACTION],
+            distribution_class=ActionDistribution,
+            distribution_kwargs={"layout": layout},
+            return_log_prob=True,
+            log_prob_key=keys.LOG_PROB,
+            default_interaction_type=InteractionType.RANDOM,
+        )
+        self.obs_keys, self.layout = list(obs_keys), layout
+
+    def draw(self, entries: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return random actions ``[..., C + K]`` and their log-probabilities ``[...]``, without gradients.
+
+        The same numbers as `forward` writes in exploration; collecting asks here, because on small
+        networks the wrappers between `forward` and the network cost more than the network.
+        """
+        with torch.no_grad():
+            params = self.module[0].module(*[entries.get(key) for key in self.obs_keys])
+            mask = entries.get(keys.MASK) if self.layout.branches else None
+            dist = ActionDistribution(params, self.layout, mask)
+            action = dist.sample()
+            return action, dist.log_prob(action)
+
+
+def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig) -> UnityActor:
     """Build the policy as a TorchRL actor over the entries of one policy name."""
     if cfg.share_parameters or team_size == 1:
         net: nn.Module = Actor(obs, layout, cfg)
     else:
         net = PerMember([Actor(obs, layout, cfg) for _ in range(team_size)], obs.team_dims)
-    module = TensorDictModule(net, in_keys=list(obs.keys), out_keys=["params"])
-    in_keys = {"params": "params"} | ({"mask": keys.MASK} if layout.branches else {})
-    return ProbabilisticActor(
-        module,
-        in_keys=in_keys,
-        out_keys=[keys.ACTION],
-        distribution_class=ActionDistribution,
-        distribution_kwargs={"layout": layout},
-        return_log_prob=True,
-        log_prob_key=keys.LOG_PROB,
-        default_interaction_type=InteractionType.RANDOM,
-    )
+    return UnityActor(net, obs.keys, layout)
 
 
 def make_critic(obs: ObsLayout, team_size: int, cfg: ModelConfig) -> TensorDictModule:
@@ -121,9 +150,14 @@ class JointPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write every name's action and log-probability beside its observation."""
+        collecting = not torch.is_grad_enabled() and exploration_type() is ExplorationType.RANDOM
         for name, inputs, actor in zip(self.names, self.inputs, self.actors.values()):
             entries = tensordict.get(name)
-            out = actor(entries.select(*inputs, strict=False))
-            entries.set(keys.ACTION, out.get(keys.ACTION))
-            entries.set(keys.LOG_PROB, out.get(keys.LOG_PROB))
+            if collecting and isinstance(actor, UnityActor):
+                action, log_prob = actor.draw(entries)
+            else:
+                out = actor(entries.select(*inputs, strict=False))
+                action, log_prob = out.get(keys.ACTION), out.get(keys.LOG_PROB)
+            entries.set(keys.ACTION, action)
+            entries.set(keys.LOG_PROB, log_prob)
         return tensordict

@@ -4,12 +4,14 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.distributions import Categorical, Normal
+from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity.actions import ActionDistribution, ActionLayout
 from mappo_unity.config import ModelConfig
 from mappo_unity.encoders import ObsLayout, RunningNorm
-from mappo_unity.models import Actor, make_actor
+from mappo_unity.models import Actor, JointPolicy, make_actor
 from mappo_unity.value_norm import ValueNorm
 
 
@@ -82,10 +84,31 @@ def test_the_first_actions_are_near_the_middle_and_spread_by_init_log_std():
 
 
 def test_actor_writes_action_and_log_prob():
-    from tensordict import TensorDict
-
     actor = make_actor(ObsLayout(4), ActionLayout(0, (3, 3)), 2, ModelConfig())
     mask = torch.ones(7, 2, 6, dtype=torch.bool)
     out = actor(TensorDict({"observation": torch.randn(7, 2, 4), "action_mask": mask}, [7, 2]))
     assert out["action"].shape == (7, 2, 2)
     assert out["action_log_prob"].shape == (7, 2)
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [ActionLayout(2, ()), ActionLayout(0, (3, 2)), ActionLayout(1, (2,)), ActionLayout(0, (2, 2), True)],
+)
+def test_draws_are_what_the_actor_writes_while_exploring(layout):
+    torch.manual_seed(0)
+    actor = make_actor(ObsLayout(3), layout, 2, ModelConfig(hidden=[8], share_parameters=False))
+    entries = TensorDict({"observation": torch.randn(5, 2, 3)}, [5, 2])
+    mask = [torch.arange(size) < torch.randint(1, size + 1, (5, 2, 1)) for size in layout.branches]
+    entries["action_mask"] = torch.cat(mask, -1) if mask else torch.ones(5, 2, 0, dtype=torch.bool)
+    torch.manual_seed(1)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        out = actor(entries.copy())
+    torch.manual_seed(1)
+    action, log_prob = actor.draw(entries)
+    assert torch.equal(action, out["action"]) and action.dtype == out["action"].dtype
+    assert torch.equal(log_prob, out["action_log_prob"]) and not log_prob.requires_grad
+    policy = JointPolicy({"Fake": actor})
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        likely = policy(TensorDict({"Fake": entries.copy()}))["Fake", "action"]
+        assert torch.equal(likely, actor(entries.copy())["action"])
