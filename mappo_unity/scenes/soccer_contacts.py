@@ -13,30 +13,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-FRICTION = 0.6  # of every pair: nothing has another friction than the default
+FRICTION = np.array(0.6)  # of every pair: nothing has another friction than the default
 RESTITUTION = 0.8  # of the ball with anything; agents have none
-BOUNCE_SPEED = 2.0  # m/s: slower approaches do not bounce
+BOUNCE_SPEED = np.array(2.0)  # m/s: slower approaches do not bounce
 ITERATIONS = 6
 _SETTLED = 1e-9  # kg m/s: an iteration that changes less ends the solve
+_ZERO, _ONE = np.array(0.0), np.array(1.0)  # NumPy takes arrays twice as fast as Python's numbers
 
 
 class Contacts(NamedTuple):
-    """Contacts of body `i` with body `j`; a ball is always `i`, the pitch always `j`. All arrays [n]."""
+    """Contacts of one body with another, n of them; a ball is always the first, the pitch the second."""
 
-    i: np.ndarray
-    j: np.ndarray
-    normal_x: np.ndarray
-    """Unit normal from `j` to `i`."""
-    normal_z: np.ndarray
+    bodies: np.ndarray
+    """Numbers of both, int64 [2, n]."""
+    normal: np.ndarray
+    """Unit normal from the second to the first, x and z, [2, n]."""
     gap: np.ndarray
-    """Distance of the surfaces, m; negative: penetration."""
+    """Distance of the surfaces, m, [n]; negative: penetration."""
 
 
 class Bodies:
     """Hold the bodies' velocities, and solve contacts between them.
 
-    `velocity` float64 [2, M] x, z; `spin` float64 [M] about y, rad/s, clockwise seen from above;
-    `inverse_mass` float64 [M], 1/kg.
+    `velocity` float64 [2, M] x, z; `spin` float64 [M] about y, rad/s, clockwise seen from above.
     """
 
     def __init__(self, num_balls: int, num_agents: int, ball: tuple[float, float], agent_mass: float) -> None:
@@ -54,7 +53,10 @@ class Bodies:
             :, None
         ]
         self.constants[:, -1] = 0
-        self.inverse_mass = self.constants[0]
+        # the velocities one after another, and at the same places the inverse masses that weigh impulses
+        self.flat_velocity = self.velocity.reshape(-1)
+        self.flat_weight = np.tile(self.constants[0], 2)
+        self.axes = np.array([[0], [num]])  # where x and z begin
 
     def solve(self, contacts: Contacts, tick_s: float) -> Solved:
         """Stop or bounce approaching pairs and rub them."""
@@ -76,7 +78,7 @@ class Solved:
 
     def repeat(self, iterate: Callable[[_Rows], np.ndarray]) -> None:
         """Iterate once over contacts that share no body, up to six times over the others."""
-        if len(self._alone.i):
+        if self._alone.mass.size:
             iterate(self._alone)
         for _ in range(ITERATIONS if self._ranks else 0):
             if max([np.abs(iterate(rank)).max() for rank in self._ranks]) < _SETTLED:
@@ -88,24 +90,31 @@ class Solved:
         A tick removes `share` of a penetration, at most `most` m; pairs apart do not get into each other.
         Contacts that bounce are left alone. Ways, not speeds: nothing of it is kept.
         """
-        rows = self._all
-        short = rows.missing(moves, share, most)
-        if (short > 0).any():
-            self.repeat(lambda part: part.push(moves, share, most))
+        flat = moves.reshape(-1)
+        self._all.aim(share, most)
+        _, short = self._all.missing(flat)
+        if not np.count_nonzero(short > _ZERO):
+            return
+        for part in (self._alone, *self._ranks) if self._ranks else ():  # those are copies
+            part.aim(share, most)
+        self.repeat(lambda part: part.push(flat))
 
 
 def _shared(contacts: Contacts, num_bodies: int) -> np.ndarray | None:
     """Return which contacts have a body in common with another one, the pitch excepted; None: none has."""
-    count = np.bincount(np.concatenate([contacts.i, contacts.j]), minlength=num_bodies)
+    count = np.bincount(contacts.bodies.reshape(-1), minlength=num_bodies)
     count[-1] = 0
     many = count > 1
-    return many[contacts.i] | many[contacts.j] if many.any() else None
+    if not np.count_nonzero(many):
+        return None
+    first, second = many[contacts.bodies]
+    return first | second
 
 
 def _ranks(contacts: Contacts, shared: np.ndarray, num_fields: int) -> list[np.ndarray]:
     """Return rows of the shared contacts: the first of every field, the second of every field, ..."""
     rows = np.flatnonzero(shared)
-    field = contacts.i[rows] % num_fields
+    field = contacts.bodies[0, rows] % num_fields
     order = np.argsort(field, kind="stable")
     rows, field = rows[order], field[order]
     rank = np.arange(len(rows)) - np.searchsorted(field, field)
@@ -113,61 +122,87 @@ def _ranks(contacts: Contacts, shared: np.ndarray, num_fields: int) -> list[np.n
 
 
 class _Rows:
-    """Some contacts: what an iteration needs, and the impulses so far, `press` and `rub`, kg m/s [n]."""
+    """Some contacts: what an iteration needs, and the impulses so far, `press` and `rub`, kg m/s [n].
+
+    Pairs come as [2 bodies, 2 axes, n], so that each body's part is contiguous: for a few contacts the
+    time goes into NumPy's calls, and contiguous operands cost it least.
+    """
 
     def __init__(self, bodies: Bodies, contacts: Contacts, tick_s: float) -> None:
-        self.velocity, self.spin = bodies.velocity, bodies.spin
-        self.i, self.j, self.normal_x, self.normal_z, self.gap = contacts
-        x, z = self.velocity[:, self.i] - self.velocity[:, self.j]
-        approach = -x * self.normal_x - z * self.normal_z
-        self.bounces = (approach > BOUNCE_SPEED) & (self.i < bodies.num_balls)
-        allowed = np.maximum(self.gap, 0) * (-1 / tick_s)
-        self.leave_speed = np.where(self.bounces, RESTITUTION * approach, allowed)
-        self.weight_i, rub_weight, self.lever, self.spin_gain = bodies.constants[:, self.i]
-        self.weight_j = bodies.inverse_mass[self.j]
-        self.mass = 1 / (self.weight_i + self.weight_j)
-        self.rub_mass = 1 / (rub_weight + self.weight_j)
+        self.velocity, self.spin = bodies.flat_velocity, bodies.spin
+        pair, self.normal, self.gap = contacts
+        self.first = pair[0]
+        self.tangent = np.empty_like(self.normal)
+        np.negative(self.normal[1], out=self.tangent[0])
+        self.tangent[1] = self.normal[0]
+        self.places = pair[:, None] + bodies.axes  # of the velocities [2, 2, n]
+        self.weight = bodies.flat_weight.take(self.places)
+        _, rub_weight, self.lever, self.spin_gain = bodies.constants.take(self.first, 1)
+        weight_i, weight_j = self.weight[:, 0]
+        self.mass = _ONE / (weight_i + weight_j)
+        self.rub_mass = _ONE / (rub_weight + weight_j)
+        leaving = _along(self.normal, _difference(self.velocity[self.places]))
+        self.bounces = (leaving < -BOUNCE_SPEED) & (self.first < bodies.num_balls)
+        self.leave_speed = np.maximum(self.gap, _ZERO) * (-1 / tick_s)
+        if np.count_nonzero(self.bounces):
+            np.copyto(self.leave_speed, -RESTITUTION * leaving, where=self.bounces)
         self.press = self.rub = self.pushed = np.zeros(len(self.gap))
 
     def part(self, rows: np.ndarray) -> _Rows:
         """Return these rows alone."""
         part = object.__new__(_Rows)
         for name, value in vars(self).items():
-            setattr(part, name, value if name in ("velocity", "spin") else value[rows])
+            setattr(part, name, value if name in ("velocity", "spin") else value.take(rows, -1))
         return part
 
     def stop(self) -> np.ndarray:
         """Apply one iteration to speeds, if no two contacts share a body; return changes of `press`."""
-        velocity, spin, i, j = self.velocity, self.spin, self.i, self.j
-        normal_x, normal_z = self.normal_x, self.normal_z
-        x, z = velocity[:, i] - velocity[:, j]
-        pressed = np.maximum(self.press + (self.leave_speed - x * normal_x - z * normal_z) * self.mass, 0)
-        slip = z * normal_x - x * normal_z + spin[i] * self.lever  # along (-normal_z, normal_x)
+        pair = self.velocity[self.places]
+        speed = _difference(pair)
+        away, slip = speed * self.normal, _along(self.tangent, speed)
+        pressed = np.maximum(self.press + (self.leave_speed - away[0] - away[1]) * self.mass, _ZERO)
+        spin = self.spin[self.first]
         limit = FRICTION * pressed
-        rubbed = np.minimum(np.maximum(self.rub - slip * self.rub_mass, -limit), limit)
+        rubbed = self.rub - (slip + spin * self.lever) * self.rub_mass
+        np.minimum(np.maximum(rubbed, -limit, out=rubbed), limit, out=rubbed)
         press, rub = pressed - self.press, rubbed - self.rub
         self.press, self.rub = pressed, rubbed
-        self._apply(velocity, press * normal_x - rub * normal_z, press * normal_z + rub * normal_x)
-        spin[i] += rub * self.spin_gain
+        self._apply(self.velocity, pair, press * self.normal + rub * self.tangent)
+        self.spin[self.first] = spin + rub * self.spin_gain
         return press
 
-    def missing(self, moves: np.ndarray, share: float, most: float) -> np.ndarray:
-        """Return how much further apart the pairs must move, m [n]."""
-        x, z = moves[:, self.i] - moves[:, self.j]
-        deep = np.minimum(self.gap, 0)
-        wanted = np.minimum(-share * deep, most) + deep - self.gap - x * self.normal_x - z * self.normal_z
-        return np.where(self.bounces, -1.0, wanted)
+    def aim(self, share: float, most: float) -> None:
+        """Set how much further apart the pairs shall be, m [n]; pairs that bounce are let be."""
+        deep = np.minimum(self.gap, _ZERO)
+        self.wanted = np.minimum(-share * deep, most) + deep - self.gap
+        self.wanted[self.bounces] = -np.inf
 
-    def push(self, moves: np.ndarray, share: float, most: float) -> np.ndarray:
+    def missing(self, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return both bodies' ways [2, 2, n], of all ways [2 M], and what they lack of `aim`, m [n]."""
+        pair = moves[self.places]
+        way = _difference(pair) * self.normal
+        return pair, self.wanted - way[0] - way[1]
+
+    def push(self, moves: np.ndarray) -> np.ndarray:
         """Apply one iteration to ways, as `stop` does to speeds; return changes of `pushed`."""
-        pushed = np.maximum(self.pushed + self.missing(moves, share, most) * self.mass, 0)
-        push = np.where(self.bounces, 0, pushed - self.pushed)
+        pair, short = self.missing(moves)
+        push = np.maximum(self.pushed + short * self.mass, _ZERO) - self.pushed
         self.pushed = self.pushed + push
-        self._apply(moves, push * self.normal_x, push * self.normal_z)
+        self._apply(moves, pair, push * self.normal)
         return push
 
-    def _apply(self, to: np.ndarray, x: np.ndarray, z: np.ndarray) -> None:
-        to[0, self.i] += x * self.weight_i
-        to[1, self.i] += z * self.weight_i
-        to[0, self.j] -= x * self.weight_j
-        to[1, self.j] -= z * self.weight_j
+    def _apply(self, to: np.ndarray, pair: np.ndarray, impulse: np.ndarray) -> None:
+        """Set what `pair` becomes by an impulse [2, n] on its first bodies and off its second."""
+        pair[0] += impulse * self.weight[0]
+        pair[1] -= impulse * self.weight[1]
+        to[self.places] = pair
+
+
+def _difference(pair: np.ndarray) -> np.ndarray:
+    return pair[0] - pair[1]
+
+
+def _along(direction: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Return scalar products of [2, n] with [2, n]."""
+    parts = direction * vector
+    return parts[0] + parts[1]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.scenes.soccer_contacts import Bodies, Contacts, Solved
-from mappo_unity.scenes.soccer_pitch import BALL_HEIGHT, GOAL_FLOOR_X, MARGIN, POST_X, Gaps, Pitch
+from mappo_unity.scenes.soccer_pitch import BALL_HEIGHT, GOAL_FLOOR_X, MARGIN, POST_X, Faced, Gaps, Pitch
 
 TICK_S = 0.02
 AGENT_RADIUS, AGENT_MASS = 0.5, 50.0  # m, kg
@@ -30,6 +30,10 @@ GOAL_LINE_X = GOAL_FLOOR_X - (BALL_RADIUS**2 - BALL_HEIGHT**2) ** 0.5  # of a ba
 GOAL_NEAR_X = min(POST_X) - BALL_RADIUS - MARGIN  # a ball nearer to the middle touches no part of a goal
 SLIP_SHARE = 2 / 7  # of the ball's way at most lost to its rub on the floor: solid sphere, slip to roll
 SLIP_WAY = 0.35 * PUSH_OUT * (BALL_RADIUS - BALL_HEIGHT)  # m in a tick: friction times push-out
+# as arrays: NumPy takes those twice as fast as Python's numbers
+_ZERO, _ONE, _TINY, _TICK = np.array(0.0), np.array(1.0), np.array(1e-12), np.array(TICK_S)
+_BALL_KEPT, _MAX_SPIN, _MIN_SPIN = np.array(BALL_KEPT), np.array(MAX_SPIN), np.array(-MAX_SPIN)
+_SLIP_SHARE, _SLIP_WAY = np.array(SLIP_SHARE), np.array(SLIP_WAY)
 
 
 class SoccerPhysics:
@@ -49,7 +53,12 @@ class SoccerPhysics:
         self.position = np.zeros((2, *bodies))
         self.velocity = self._bodies.velocity[:, : self._last].reshape(2, *bodies)
         self.spin = self._bodies.spin[:num_fields]
-        self.kick = np.zeros((2, num_fields))
+        # velocity changes of a tick by the bodies' numbers; kicks and drives are their parts
+        self._change = np.zeros((2, self._last + 1))
+        self.kick = self._change[:, :num_fields]
+        self._drive = self._change[:, num_fields : self._last].reshape(2, num_agents, num_fields)
+        self._kept = np.full((2, self._last + 1), AGENT_KEPT)
+        self._kept[:, :num_fields] = BALL_KEPT
         self.touching = np.zeros((num_agents, num_fields), bool)
         radius = np.where(np.arange(bodies[0]) == 0, BALL_RADIUS, AGENT_RADIUS)
         self._radius = np.repeat(radius, num_fields)
@@ -57,7 +66,7 @@ class SoccerPhysics:
         self._gaps: Gaps | None = None  # of `position`; None: bodies were placed or stopped since
         self._first, self._second = np.array(list(combinations(range(bodies[0]), 2))).T
         reach = radius[self._first] + radius[self._second] + MARGIN
-        self._reach_squared = (reach**2)[:, None]
+        self._reach_squared = np.repeat((reach**2)[:, None], num_fields, axis=1)
 
     def place(self, body: int, fields: np.ndarray, x: np.ndarray | float, z: np.ndarray | float) -> None:
         """Put a body of `fields` [n] at rest at x, z [n]; a kick that waits for its tick still comes."""
@@ -77,8 +86,8 @@ class SoccerPhysics:
         """
         self._accelerate(drive)
         contacts, begun = self._contacts()
-        points = self._kick_points(begun) if begun.any() else None
-        solved = self._bodies.solve(contacts, TICK_S) if len(contacts.i) else None
+        points = self._kick_points(begun) if np.count_nonzero(begun) else None
+        solved = None if contacts is None else self._bodies.solve(contacts, TICK_S)
         start = self.position
         self.position = start + self._moves(solved)
         self._stop_at_pitch(start)
@@ -97,43 +106,51 @@ class SoccerPhysics:
         self._gaps = None
 
     def _accelerate(self, drive: np.ndarray) -> None:
-        velocity, kick = self.velocity, self.kick
-        velocity[:, 1:] += drive
-        velocity[:, 1:] *= AGENT_KEPT
-        velocity[:, 0] += kick
-        velocity[:, 0] *= BALL_KEPT
-        kick[...] = 0
+        bodies = self._bodies
+        self._drive[...] = drive
+        bodies.velocity += self._change
+        bodies.velocity *= self._kept
+        self.kick[...] = _ZERO
         spin = self.spin
-        spin *= BALL_KEPT
-        np.minimum(spin, MAX_SPIN, out=spin)
-        np.maximum(spin, -MAX_SPIN, out=spin)
+        spin *= _BALL_KEPT
+        np.minimum(spin, _MAX_SPIN, out=spin)
+        np.maximum(spin, _MIN_SPIN, out=spin)
 
-    def _contacts(self) -> tuple[Contacts, np.ndarray]:
+    def _contacts(self) -> tuple[Contacts | None, np.ndarray]:
         """Return all contacts of this tick, and who begins one with the ball, bool [A, F]."""
         position = self.position
-        away = position[:, self._first] - position[:, self._second]  # [2, pairs, F]
-        squared = away[0] * away[0] + away[1] * away[1]
+        away = position.take(self._first, 1) - position.take(self._second, 1)  # [2, pairs, F]
+        squares = away * away
+        squared = squares[0] + squares[1]
         close = squared < self._reach_squared
         touching = close[: self.num_agents]
-        begun = touching & ~self.touching
+        begun = touching > self.touching
         self.touching = touching
         parts = []
-        if close.any():
-            pair, field = np.nonzero(close)
-            distance = np.sqrt(squared[pair, field]) + 1e-12
-            i, j = self._first[pair] * self.num_fields + field, self._second[pair] * self.num_fields + field
-            gap = distance - self._radius[i] - self._radius[j]
-            x, z = away[:, pair, field] / distance
-            parts.append(Contacts(i, j, x, z, gap))
-        x, z = self._flat(position)
+        if np.count_nonzero(close):
+            parts.append(self._pairs(close, away, squared))
+        at = self._flat(position)
         if self._gaps is None:
-            self._gaps = self.pitch.gaps(x, z, self._radius)
-        body, x, z, gap = self.pitch.contacts(x, z, self._gaps)
-        if body.size:
-            parts.append(Contacts(body, np.full(len(body), self._last), x, z, gap))
-        if len(parts) == 1:
-            return parts[0], begun
-        return (Contacts(*map(np.concatenate, zip(*parts, strict=True))) if parts else _NO_CONTACTS), begun
+            self._gaps = self.pitch.gaps(at, self._radius)
+        faced = self.pitch.contacts(at, self._gaps)
+        if faced.disc.size:
+            parts.append(self._with_pitch(faced))
+        if len(parts) == 2:
+            return Contacts(*(np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))), begun
+        return (parts[0] if parts else None), begun
+
+    def _pairs(self, close: np.ndarray, away: np.ndarray, squared: np.ndarray) -> Contacts:
+        """Return contacts of bodies with each other: the pairs and fields that are `close`."""
+        pair, field = close.nonzero()
+        distance = np.sqrt(squared[pair, field]) + 1e-12
+        bodies = np.stack([self._first[pair], self._second[pair]]) * self.num_fields + field
+        first, second = self._radius[bodies]
+        return Contacts(bodies, away[:, pair, field] / distance, distance - first - second)
+
+    def _with_pitch(self, faced: Faced) -> Contacts:
+        bodies = np.empty((2, len(faced.disc)), np.int64)
+        bodies[0], bodies[1] = faced.disc, self._last
+        return Contacts(bodies, faced.normal, faced.gap)
 
     def _moves(self, solved: Solved | None) -> np.ndarray:
         """Return the ways of a tick [2, B, F]: velocity, less the balls' slip, plus push-out.
@@ -141,10 +158,11 @@ class SoccerPhysics:
         The floor takes way but no speed from the ball, and a push-out gives way but no speed: both act in
         the engine's position iterations only.
         """
-        moves = self._bodies.velocity * TICK_S
-        x, z = ball = moves[:, : self.num_fields]
-        way = np.sqrt(x * x + z * z) + 1e-12
-        ball *= 1 - np.minimum(SLIP_SHARE, SLIP_WAY / way)
+        moves = self._bodies.velocity * _TICK
+        ball = moves[:, : self.num_fields]
+        squares = ball * ball
+        way = np.sqrt(squares[0] + squares[1]) + _TINY
+        ball *= _ONE - np.minimum(_SLIP_SHARE, _SLIP_WAY / way)
         if solved is not None:
             solved.push_out(moves, PUSH_OUT, MAX_PUSH_OUT)
         return moves[:, : self._last].reshape(self.position.shape)
@@ -155,20 +173,18 @@ class SoccerPhysics:
         A body that was in contact at the start slides on instead of losing the rest of its way.
         """
         begin, end = self._flat(start), self._flat(self.position)
-        before, self._gaps = self._gaps, self.pitch.gaps(end[0], end[1], self._radius)
+        before, self._gaps = self._gaps, self.pitch.gaps(end, self._radius)
         assert before is not None
         hits, share = self.pitch.way(begin, end, before, self._gaps, self._radius)
-        body, normal_x, normal_z, gap = hits
-        if not body.size:
+        if not hits.disc.size:
             return
-        step_x, step_z = end[:, body] - begin[:, body]
-        slides = gap - normal_x * step_x - normal_z * step_z < MARGIN
-        back = share - 1
-        end[0, body] += np.where(slides, -gap * normal_x, back * step_x)
-        end[1, body] += np.where(slides, -gap * normal_z, back * step_z)
+        body, normal, gap = hits
+        step = end[:, body] - begin[:, body]
+        into = normal * step
+        slides = gap - into[0] - into[1] < MARGIN
+        end[:, body] += np.where(slides, -gap * normal, (share - 1) * step)
         self._gaps = None
-        pitch = np.full(len(body), self._last)
-        self._bodies.solve(Contacts(body, pitch, normal_x, normal_z, np.zeros(len(body))), TICK_S)
+        self._bodies.solve(self._with_pitch(Faced(body, normal, np.zeros(len(body)))), TICK_S)
 
     def _kick_points(self, begun: np.ndarray) -> np.ndarray:
         """Return the points of contact [2, k] of agents that began one: midway between the surfaces."""
@@ -205,4 +221,3 @@ class SoccerPhysics:
 
 
 _STATE = ("position", "velocity", "spin", "kick", "touching")
-_NO_CONTACTS = Contacts(*np.zeros((2, 0), np.int64), *np.zeros((3, 0)))

@@ -30,27 +30,33 @@ GOAL_FLOOR_X, GOAL_FLOOR_Z = 15.5, 4.25  # front edge and half-width of the goal
 BALL_HEIGHT = 0.5  # of the ball's centre above the goals' floors
 BLOCK_X, BLOCK_Z = 15.01, 3.957  # inner face and half-width of the block that closes a blue goal
 _ROUNDING = 1e-6  # m: a disc less deep than this has not hit anything
-_CORNER, _MOUTH, _EDGE, _BLOCK = 1, 2, 3, 5  # features: side, corner, net's side, mouth's edge, back, block
-_NORMAL_X = np.array([0.0, -_C, 0.0, 0.0, -1.0, -1.0])
-_NORMAL_Z = np.array([-1.0, -_S, -1.0, 0.0, 0.0, 0.0])
+_SIDE, _CORNER, _NET, _EDGE, _BACK = range(5)  # features: long side, corner wall, net's side, its front, back
+_NORMAL = np.array([[0.0, -_C, 0.0, 0.0, -1.0], [-1.0, -_S, -1.0, 0.0, 0.0]])
+# as arrays: NumPy takes those twice as fast as Python's numbers
+_ZERO, _ONE, _MARGIN, _DEEP = np.array(0.0), np.array(1.0), np.array(MARGIN), np.array(-_ROUNDING)
+_COS, _SIN, _CORNER_STOP = np.array(_C), np.array(_S), np.array(CORNER_END)
+_SIDE_GAP, _CORNER_GAP, _NET_GAP = np.array(SIDE_Z), np.array(CORNER_OFFSET), np.array(NET_Z)
 
 
 class Gaps(NamedTuple):
     """Distances of discs from the pitch's features, m, inf where not faced; negative: penetration."""
 
     gap: np.ndarray
-    """[5, n]: long side, corner wall, the mouth's face (net's side, or block), its front edge, net's back."""
-    past_end: np.ndarray
-    """Whether the corner wall has ended where the disc is, bool [n]; the gap is then that from its plane."""
+    """[5, n]: long side, corner wall, net's side, a mouth's edge, net's back or block."""
+    beside_corner: np.ndarray
+    """Whether the disc is beside the corner wall, bool [n], and not where this has ended; the gap is from
+    its plane."""
 
 
 class Faced(NamedTuple):
-    """Features that discs touch: number of the disc int64, unit normal off the surface, gap in m; all [k]."""
+    """Features that discs touch, k of them."""
 
     disc: np.ndarray
-    normal_x: np.ndarray
-    normal_z: np.ndarray
+    """Number of the disc, int64 [k]."""
+    normal: np.ndarray
+    """Unit normal off the surface, x and z, [2, k]."""
     gap: np.ndarray
+    """m, [k]."""
 
 
 class Pitch:
@@ -58,65 +64,69 @@ class Pitch:
 
     def __init__(self, blue_closed: bool = False) -> None:
         self.blue_closed = blue_closed
+        # what differs between the ends, [6, 2] blue and purple, folded like the discs: the mouth's edge x
+        # and z, where the net's sides begin, the back's x and half-width, and up to which z no edge is met
+        ends = [
+            (post, NET_Z, post, back, GOAL_FLOOR_Z, -1.0) for post, back in zip(POST_X, BACK_X, strict=True)
+        ]
+        if blue_closed:
+            ends[0] = (BLOCK_X, BLOCK_Z, math.inf, BLOCK_X, BLOCK_Z, BLOCK_Z)
+        self._ends = np.array(ends).T.copy()
 
-    def gaps(self, x: np.ndarray, z: np.ndarray, radius: np.ndarray) -> Gaps:
-        """Return the distances of n discs from everything that they face."""
-        ax, az = np.abs(x), np.abs(z)
-        purple = x > 0
+    def gaps(self, at: np.ndarray, radius: np.ndarray) -> Gaps:
+        """Return the distances from everything that they face of n discs `at` x, z [2, n]."""
+        folded = np.abs(at)
+        x, z = folded
+        ends = self._ends.take(at[0] > _ZERO, 1)
+        along = folded - ends[:2]
+        squares = along * along
         gap = np.empty((5, len(x)))
-        np.subtract(SIDE_Z, az, out=gap[0])
-        np.subtract(CORNER_OFFSET, _C * ax + _S * az, out=gap[1])
-        edge_x, edge_z = self._edge(purple)
-        along_x, along_z = ax - edge_x, az - edge_z
-        beside = along_x > 0
-        gap[2] = np.where(beside, NET_Z - az, np.inf)
-        gap[4] = np.where(az < GOAL_FLOOR_Z, np.where(purple, BACK_X[1], BACK_X[0]) - ax, np.inf)
-        if self.blue_closed:
-            beside = np.where(purple, beside, along_z < 0)
-            gap[2] = np.where(purple, gap[2], np.where(beside, BLOCK_X - ax, np.inf))
-            gap[4, ~purple] = np.inf
-        gap[3] = np.where(beside, np.inf, np.sqrt(along_x * along_x + along_z * along_z))
+        np.subtract(_SIDE_GAP, z, out=gap[_SIDE])
+        np.subtract(_CORNER_GAP, _COS * x + _SIN * z, out=gap[_CORNER])
+        np.subtract(_NET_GAP, z, out=gap[_NET])
+        np.sqrt(squares[0] + squares[1], out=gap[_EDGE])
+        np.subtract(ends[3], x, out=gap[_BACK])
+        in_net = x > ends[2]
+        gap[_NET, ~in_net] = np.inf
+        gap[_EDGE, in_net | (z < ends[5])] = np.inf
+        gap[_BACK, z >= ends[4]] = np.inf
         gap -= radius
-        return Gaps(gap, _S * ax - _C * az > CORNER_END)
+        return Gaps(gap, _SIN * x - _COS * z <= _CORNER_STOP)
 
-    def contacts(self, x: np.ndarray, z: np.ndarray, gaps: Gaps) -> Faced:
+    def contacts(self, at: np.ndarray, gaps: Gaps) -> Faced:
         """Return the contacts of n discs with walls, nets and block: all gaps below 0.02 m."""
-        close = gaps.gap < MARGIN
-        close[_CORNER] &= ~gaps.past_end
-        feature, disc = np.nonzero(close)
-        return self._faced(feature, disc, x, z, gaps.gap[feature, disc])
+        close = gaps.gap < _MARGIN
+        close[_CORNER] &= gaps.beside_corner
+        feature, disc = close.nonzero()
+        return self._faced(feature, disc, at, gaps.gap[feature, disc])
 
     def way(
-        self,
-        start: np.ndarray,
-        end: np.ndarray,
-        before: Gaps,
-        after: Gaps,
-        radius: np.ndarray,
+        self, start: np.ndarray, end: np.ndarray, before: Gaps, after: Gaps, radius: np.ndarray
     ) -> tuple[Faced, np.ndarray]:
         """Return what ends the straight ways of n discs from `start` to `end` [2, n], and at which share.
 
         Each disc has at most one entry. The gaps are those at the ways' ends: negative, as deep as the
         discs would be.
         """
-        hit = after.gap < -_ROUNDING
-        hit[_CORNER] &= ~(before.past_end & after.past_end)
-        step_x, step_z = end - start
+        hit = after.gap < _DEEP
+        hit[_CORNER] &= before.beside_corner | after.beside_corner
+        step = end - start
+        step *= step
         # a way that meets an edge is at least as long as the gaps before and after it
-        hit[_EDGE] |= before.gap[_EDGE] + after.gap[_EDGE] < np.sqrt(step_x * step_x + step_z * step_z)
-        if not hit.any():
+        hit[_EDGE] |= before.gap[_EDGE] + after.gap[_EDGE] < np.sqrt(step[0] + step[1])
+        if not np.count_nonzero(hit):
             return _NOTHING, _NOTHING.gap
         edge = np.flatnonzero(hit[_EDGE])
         hit[_EDGE] = False
-        feature, disc = np.nonzero(hit)
-        faced = self._faced(feature, disc, end[0], end[1], after.gap[feature, disc])
+        feature, disc = hit.nonzero()
+        faced = self._faced(feature, disc, end, after.gap[feature, disc])
         faced, share = _ends(faced, start, end)
         if edge.size:
             edges, until = self._edge_ways(edge, start, end, radius)
             faced, share = _joined(faced, edges), np.concatenate([share, until])
         order = np.lexsort((share, faced.disc))
         order = order[np.diff(faced.disc[order], prepend=-1) > 0]  # the first that ends a way
-        return Faced(*(each[order] for each in faced)), share[order]
+        return _part(faced, order), share[order]
 
     def goals(self, x: np.ndarray, z: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return how often balls touch the blue goal's parts and the purple goal's, int64 [n] each.
@@ -135,27 +145,20 @@ class Pitch:
         blue = np.zeros_like(parts) if self.blue_closed else np.where(purple, 0, parts)
         return blue, np.where(purple, parts, 0)
 
-    def _edge(self, purple: np.ndarray) -> tuple[np.ndarray, np.ndarray | float]:
-        """Return where the front edge of a mouth is, by end: of a net's side (post), or of the block."""
-        if not self.blue_closed:
-            return np.where(purple, POST_X[1], POST_X[0]), NET_Z
-        return np.where(purple, POST_X[1], BLOCK_X), np.where(purple, NET_Z, BLOCK_Z)
+    def _edge(self, x: np.ndarray) -> np.ndarray:
+        """Return where the front edge of the mouth is at the ends of `x` [k], folded, [2, k]."""
+        return self._ends[:2].take(x > 0, 1)
 
-    def _faced(
-        self, feature: np.ndarray, disc: np.ndarray, x: np.ndarray, z: np.ndarray, gap: np.ndarray
-    ) -> Faced:
+    def _faced(self, feature: np.ndarray, disc: np.ndarray, at: np.ndarray, gap: np.ndarray) -> Faced:
         """Return features with their normals, given their gaps [k] and the positions of all discs."""
-        x, z = x[disc], z[disc]
-        if self.blue_closed:
-            feature = np.where((feature == _MOUTH) & (x < 0), _BLOCK, feature)
-        normal_x, normal_z = _NORMAL_X[feature], _NORMAL_Z[feature]
-        edge = np.flatnonzero(feature == _EDGE)
+        at = at.take(disc, 1)
+        normal = _NORMAL.take(feature, 1)
+        edge = (feature == _EDGE).nonzero()[0]
         if edge.size:
-            edge_x, edge_z = self._edge(x > 0)
-            away_x, away_z = (np.abs(x) - edge_x)[edge], (np.abs(z) - edge_z)[edge]
-            distance = np.sqrt(away_x * away_x + away_z * away_z) + 1e-12
-            normal_x[edge], normal_z[edge] = away_x / distance, away_z / distance
-        return Faced(disc, normal_x * np.copysign(1.0, x), normal_z * np.copysign(1.0, z), gap)
+            at_edge = at[:, edge]
+            normal[:, edge] = _unit(np.abs(at_edge) - self._edge(at_edge[0]))
+        normal *= np.copysign(_ONE, at)
+        return Faced(disc, normal, gap)
 
     def _edge_ways(
         self, disc: np.ndarray, start: np.ndarray, end: np.ndarray, radius: np.ndarray
@@ -164,39 +167,49 @@ class Pitch:
 
         |m + s d| = r with m from the edge to the start and d the way: s = (-b - sqrt(b^2 - a c)) / a.
         """
-        (x, z), (to_x, to_z), radius = start[:, disc], end[:, disc], radius[disc]
-        edge_x, edge_z = self._edge(to_x > 0)
-        m_x, m_z = x - np.copysign(edge_x, to_x), z - np.copysign(edge_z, to_z)
-        d_x, d_z = to_x - x, to_z - z
-        a, b = d_x * d_x + d_z * d_z, m_x * d_x + m_z * d_z
-        inside = b * b - a * (m_x * m_x + m_z * m_z - (radius - _ROUNDING) ** 2)
+        start, end, radius = start[:, disc], end[:, disc], radius[disc]
+        m, d = start - np.copysign(self._edge(end[0]), end), end - start
+        a, b = _dot(d, d), _dot(m, d)
+        inside = b * b - a * (_dot(m, m) - (radius - _ROUNDING) ** 2)
         hit = np.flatnonzero((b < 0) & (inside > 0) & (-b - np.sqrt(np.maximum(inside, 0)) < a))
         if not hit.size:
             return _NOTHING, _NOTHING.gap
-        m_x, m_z, d_x, d_z = m_x[hit], m_z[hit], d_x[hit], d_z[hit]
+        m, d = m[:, hit], d[:, hit]
         share = np.maximum((-b[hit] - np.sqrt(inside[hit])) / a[hit], 0.0)
-        away_x, away_z = m_x + share * d_x, m_z + share * d_z
-        distance = np.sqrt(away_x * away_x + away_z * away_z) + 1e-12
-        away_x, away_z = away_x / distance, away_z / distance
-        gap = away_x * (m_x + d_x) + away_z * (m_z + d_z) - radius[hit]
-        return Faced(disc[hit], away_x, away_z, gap), share
+        away = _unit(m + share * d)
+        return Faced(disc[hit], away, _dot(away, m + d) - radius[hit]), share
 
 
-_NOTHING = Faced(np.zeros(0, np.int64), *np.zeros((3, 0)))
+_NOTHING = Faced(np.zeros(0, np.int64), np.zeros((2, 0)), np.zeros(0))
 
 
 def _ends(faces: Faced, start: np.ndarray, end: np.ndarray) -> tuple[Faced, np.ndarray]:
     """Return those of some faces behind the ends of ways that the ways meet, and at which shares."""
-    disc, normal_x, normal_z, gap = faces
-    (x, z), (to_x, to_z) = start[:, disc], end[:, disc]
-    step_x, step_z = to_x - x, to_z - z
-    advance = normal_x * step_x + normal_z * step_z  # negative: towards the face
+    disc, normal, gap = faces
+    start = start.take(disc, 1)
+    step = end.take(disc, 1) - start
+    advance = _dot(normal, step)  # negative: towards the face
     meets = advance < 0
     share = np.clip(1.0 - gap / np.where(meets, advance, -1.0), 0.0, 1.0)
-    at_x, at_z = np.abs(x + share * step_x), np.abs(z + share * step_z)
-    meets &= (normal_x == 0) | (normal_z == 0) | (_S * at_x - _C * at_z <= CORNER_END)
-    return Faced(*(each[meets] for each in faces)), share[meets]
+    x, z = np.abs(start + share * step)
+    meets &= (normal[0] == 0) | (normal[1] == 0) | (_S * x - _C * z <= CORNER_END)
+    return _part(faces, meets), share[meets]
 
 
-def _joined(*parts: Faced) -> Faced:
-    return Faced(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+def _part(faces: Faced, rows: np.ndarray) -> Faced:
+    return Faced(faces.disc[rows], faces.normal[:, rows], faces.gap[rows])
+
+
+def _joined(one: Faced, other: Faced) -> Faced:
+    return Faced(*(np.concatenate(parts, axis=-1) for parts in zip(one, other, strict=True)))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return scalar products of [2, k] with [2, k]."""
+    products = a * b
+    return products[0] + products[1]
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    """Return [2, k] divided by its length."""
+    return vector / (np.sqrt(_dot(vector, vector)) + 1e-12)
