@@ -102,11 +102,7 @@ class ActionDistribution(Distribution):
         size = layout.continuous
         self.loc = params[..., :size]
         self.log_std = params[..., size : 2 * size]
-        logits = params[..., 2 * size :]
-        if mask is not None and layout.branches:
-            logits = logits.masked_fill(~layout.joint_mask(mask), torch.finfo(logits.dtype).min / 4)
-        parts = logits.split(list(layout.categoricals), -1) if layout.branches else []
-        self.log_probs = [part.log_softmax(-1) for part in parts]
+        self.log_probs = self._categoricals(params[..., 2 * size :], mask) if layout.branches else []
         super().__init__(params.shape[:-1], torch.Size([size + len(layout.branches)]), validate_args=False)
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
@@ -135,10 +131,9 @@ class ActionDistribution(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-probability ``[...]`` of actions ``[..., C + K]``, summed over columns."""
         size = self.layout.continuous
-        total = torch.zeros(())
-        if size:
-            z = (value[..., :size] - self.loc) * torch.exp(-self.log_std)
-            total = (-0.5 * z * z - self.log_std - _LOG_SQRT_2PI).sum(-1)
+        total = torch.zeros(()) if not size else self._continuous_log_prob(value[..., :size])
+        if not self.log_probs:
+            return total
         categories = self.layout.to_categories(value[..., size:].long())
         for column, log_probs in enumerate(self.log_probs):
             total = total + log_probs.gather(-1, categories[..., column : column + 1]).squeeze(-1)
@@ -152,6 +147,15 @@ class ActionDistribution(Distribution):
         for log_probs in self.log_probs:
             total = total - (log_probs.exp() * log_probs).sum(-1)
         return total
+
+    def _categoricals(self, logits: Tensor, mask: Tensor | None) -> list[Tensor]:
+        if mask is not None:
+            logits = logits.masked_fill(~self.layout.joint_mask(mask), torch.finfo(logits.dtype).min / 4)
+        return [part.log_softmax(-1) for part in logits.split(list(self.layout.categoricals), -1)]
+
+    def _continuous_log_prob(self, value: Tensor) -> Tensor:
+        z = (value - self.loc) * torch.exp(-self.log_std)
+        return (-0.5 * z * z - self.log_std - _LOG_SQRT_2PI).sum(-1)
 
     def _sample_continuous(self, sample_shape: Sequence[int]) -> Tensor:
         shape = torch.Size(sample_shape) + self.loc.shape

@@ -43,6 +43,8 @@ class Actor(nn.Module):
         if not size:
             return out
         log_std = self.log_std.clamp(*LOG_STD_RANGE).expand(*out.shape[:-1], size)
+        if not self.layout.branches:
+            return torch.cat([out, log_std], -1)
         return torch.cat([out[..., :size], log_std, out[..., size:]], -1)
 
 
@@ -150,10 +152,10 @@ class JointPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write every name's action and log-probability beside its observation."""
-        collecting = not torch.is_grad_enabled() and exploration_type() is ExplorationType.RANDOM
+        draws = exploration_type() in (None, ExplorationType.RANDOM) and not torch.is_grad_enabled()
         for name, inputs, actor in zip(self.names, self.inputs, self.actors.values()):
             entries = tensordict.get(name)
-            if collecting and isinstance(actor, UnityActor):
+            if draws and isinstance(actor, UnityActor):
                 action, log_prob = actor.draw(entries)
             else:
                 out = actor(entries.select(*inputs, strict=False))

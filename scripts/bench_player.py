@@ -204,7 +204,7 @@ def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
         f"  player process            {player_us:10.0f} us CPU (scene and its messages alone {output_us:.0f})"
     )
     print(f"  decoding a message        {decode_us:10.0f} us CPU ({len(data):,} bytes)")
-    print(f"  adapter                   {adapter_us:10.0f} us CPU (UnityEnv.step less the scene's)")
+    print(f"  adapter                   {adapter_us:10.0f} us CPU (with transforms, less the scene's steps)")
     print(f"  policy                    {policy_us:10.0f} us CPU")
     rest = cpu_us - decode_us - adapter_us - policy_us
     print(f"  transport and collector   {rest:10.0f} us CPU (what remains of the trainer's {cpu_us:.0f})")
@@ -255,16 +255,18 @@ def policy(trainer: Trainer, steps: int) -> float:
 
 
 def adapter(cfg: Config, arguments: argparse.Namespace) -> float:
-    """Return what the adapter adds to a round, CPU us: embedded, less the scene's own steps."""
+    """Return what adapter and transforms add to a round, CPU us: embedded, less the scene's own steps."""
+    from mappo_unity.transforms import transformed
     from mappo_unity.unity_env import UnityEnv
 
     make = env_function(arguments.scene, cfg.env.num_areas)
     env = UnityEnv(lambda seed: make(seed, None))
-    tensordict = env.rand_action(env.reset())
+    seen = transformed(env)
+    actions = seen.rand_action(seen.reset())
     inner_s = timed_steps(env.base_env)
     begin, inner = time.process_time(), inner_s()
     for _ in range(arguments.rounds):
-        env.step(tensordict)
+        seen.step_and_maybe_reset(actions.copy())
     own = time.process_time() - begin - (inner_s() - inner)
     return own / arguments.rounds * 1e6
 

@@ -171,7 +171,8 @@ def test_other_transforms_are_left_to_torchrl():
 
 
 @pytest.mark.parametrize("script", [behaviors, sides])
-def test_batches_are_those_of_torchrl(script):
+@pytest.mark.parametrize("device", ["cpu", "cpu:0"])  # the second one goes the way between devices
+def test_batches_are_those_of_torchrl(script, device):
     specs, results = script()
     batches = []
     for make in (transformed, torchrl_s_own):
@@ -181,7 +182,7 @@ def test_batches_are_those_of_torchrl(script):
         if make is torchrl_s_own:
             for actor in policy.actors.values():
                 actor.__class__ = ProbabilisticActor  # it cannot be asked for draws alone
-        collector = make_collector(env, policy, len(results) - 2)
+        collector = make_collector(env, policy, len(results) - 2, device)
         batches.append(next(iter(collector)))
         collector.shutdown()
     assert_same(batches[:1], batches[1:])
