@@ -116,6 +116,10 @@ class Scene(BaseEnv):
         """Return one new array float32 ``[len(slots), *sensor.shape]`` a sensor, without stacking."""
         raise NotImplementedError
 
+    def observe_all(self, slots: list[np.ndarray]) -> list[list[np.ndarray]]:
+        """Return what `observe` does for `slots` of every behavior; override to save work in common."""
+        return [self.observe(behavior, rows) if rows.size else [] for behavior, rows in enumerate(slots)]
+
     def act(self, slots: np.ndarray) -> None:
         """Execute the stored actions of `slots`; give rewards, end episodes (OnActionReceived)."""
         raise NotImplementedError
@@ -348,7 +352,8 @@ class Scene(BaseEnv):
         agents.step_count += 1
         if not self._asked.size and not len(self._queue) and self.started:
             return False
-        self._results = [self._result(behavior) for behavior in range(len(self.BEHAVIORS))]
+        frames = self.observe_all(self._asked_rows) if self._asked.size else [[] for _ in self.BEHAVIORS]
+        self._results = [self._result(behavior, own) for behavior, own in enumerate(frames)]
         return True
 
     def _finish_tick(self) -> None:
@@ -365,14 +370,14 @@ class Scene(BaseEnv):
         if self.after_tick is not None:
             self.after_tick()
 
-    def _result(self, behavior: int) -> tuple[DecisionSteps, TerminalSteps]:
+    def _result(self, behavior: int, frames: list[np.ndarray]) -> tuple[DecisionSteps, TerminalSteps]:
         terminals = self._queue.take(behavior)
         slots = self._asked_rows[behavior]
         if not slots.size:
             return self._empty[behavior], terminals
         agents = self.agents
         decisions = DecisionSteps(
-            self._observations(behavior, slots),
+            self._observations(behavior, slots, frames),
             agents.reward[slots],
             agents.agent_id[slots],
             self.action_mask(behavior, slots) if self.BEHAVIORS[behavior].branches else None,
@@ -384,8 +389,8 @@ class Scene(BaseEnv):
         agents.done[slots] = False
         return decisions, terminals
 
-    def _observations(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
-        frames = self.observe(behavior, slots)
+    def _observations(self, behavior: int, slots: np.ndarray, frames: list[np.ndarray]) -> list[np.ndarray]:
+        """Put new frames on the stacks and return what the sensors show."""
         sensors = self.BEHAVIORS[behavior].sensors
         assert [frame.shape[1:] for frame in frames] == [sensor.shape for sensor in sensors], behavior
         return [
@@ -401,7 +406,7 @@ class Scene(BaseEnv):
             rows = slots if len(self.BEHAVIORS) == 1 else slots[agents.behavior[slots] == behavior]
             if rows.size:
                 steps = TerminalSteps(
-                    self._observations(behavior, rows),
+                    self._observations(behavior, rows, self.observe(behavior, rows)),
                     agents.reward[rows],
                     np.full(rows.size, interrupted),
                     agents.agent_id[rows],

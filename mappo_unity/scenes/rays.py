@@ -16,8 +16,7 @@ agent's own collider needs no special care.
     walls = cast_upright_boxes(origin, direction, eyes.cast_radius, wall_centres, wall_halves, wall_yaws)
     frame = eyes.encode(np.concatenate([balls, walls], axis=2), tags)  # float32 [N, eyes.size]
 
-For horizontal rays `cast_rectangles` is the same as `cast_upright_boxes` in two dimensions, and faster;
-`Faces` are faster still where only one side of a wall can be seen.
+For horizontal rays `cast_rectangles` is the same as `cast_upright_boxes` in two dimensions, and faster.
 """
 
 from __future__ import annotations
@@ -192,40 +191,6 @@ def cast_rectangles(
         reach = np.broadcast_to(radius, corner.shape)[corner]
         travel[corner] = cast_spheres(start, ahead, np.copysign(extent, point), reach)
     return np.where(touching | (np.asarray(radius) <= 0), np.inf, travel)
-
-
-class Faces:
-    """Walls of which discs and rays meet only one side, all in the plane (x, z).
-
-    `begin`, `end` [..., 2]: each wall's face; its front is to the right of the way from `begin` to `end`
-    (seen from above, x right, z up). Ends that stand free are to be cast as spheres of reach `radius`.
-    """
-
-    def __init__(self, begin: np.ndarray, end: np.ndarray) -> None:
-        self._begin = begin
-        self._length = np.sqrt(_dot(end - begin, end - begin))
-        self._along = (end - begin) / self._length[..., None]
-        self._front = np.stack([self._along[..., 1], -self._along[..., 0]], axis=-1)
-
-    def cast(self, origin: np.ndarray, direction: np.ndarray, radius: np.ndarray | float) -> np.ndarray:
-        """Return the travel of a disc of `radius` until it meets the front of a wall, ends excepted.
-
-        A wall that the disc overlaps or has passed is not met; see `touches` for the ends and for gaps.
-        """
-        offset = origin - self._begin
-        height = _dot(offset, self._front) - radius
-        closing = -_dot(direction, self._front)
-        meets = (closing > _TINY) & (height >= 0)
-        travel = np.where(meets, height / np.where(meets, closing, 1.0), _FAR)
-        place = _dot(offset, self._along) + travel * _dot(direction, self._along)
-        return np.where(meets & (place >= 0) & (place <= self._length), travel, np.inf)
-
-    def touches(self, point: np.ndarray, reach: np.ndarray | float) -> np.ndarray:
-        """Return whether points [..., 2] are nearer than `reach` to walls, their ends included."""
-        offset = point - self._begin
-        place = _dot(offset, self._along)
-        beside = place - np.minimum(np.maximum(place, 0.0), self._length)
-        return beside**2 + (_dot(offset, offset) - place**2) < np.square(reach)
 
 
 def cast_upright_boxes(

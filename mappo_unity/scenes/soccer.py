@@ -94,7 +94,13 @@ class SoccerScene(Scene):
 
     def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
         """Return what the agents' rays meet, one array a sensor."""
-        return self._view.frames(behavior, slots)
+        rows = [slots[:0]] * len(self.BEHAVIORS)
+        rows[behavior] = slots
+        return self._view.frames(rows)[behavior]
+
+    def observe_all(self, slots: list[np.ndarray]) -> list[list[np.ndarray]]:
+        """Cast the rays of both behaviors at once."""
+        return self._view.frames(slots)
 
     def act(self, slots: np.ndarray) -> None:
         """Turn the agents; keep their velocity changes and kicks for the physics; reward time."""

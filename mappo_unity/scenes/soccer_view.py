@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mappo_unity.scenes.rays import Faces, RaySensor, cast_spheres
+from mappo_unity.scenes.rays import RaySensor
+from mappo_unity.scenes.soccer_casts import Walls, cast_discs, first_met, unmet_discs
 from mappo_unity.scenes.soccer_physics import AGENT_RADIUS, BALL_RADIUS, SoccerPhysics
 from mappo_unity.scenes.soccer_pitch import (
     BACK_X,
@@ -32,7 +33,9 @@ from mappo_unity.scenes.soccer_pitch import (
 )
 
 CAST_RADIUS, CAST_HEIGHT = 0.5, 0.5  # m; the height above the centres of ball and agents
+RAY_LENGTH = 20.0  # m
 TOUCH = 0.01  # m: a wall nearer than this at the start is not reported
+_BEYOND = np.nextafter(RAY_LENGTH, np.inf)  # m: what is met later is not met at all
 FORWARD, REVERSE, AROUND = (5, 60.0, 0.0), (1, 45.0, 180.0), (20, 180.0, 0.0)
 """Rays on each side, angle of the outermost, and turn of the sensor, in degrees."""
 
@@ -51,7 +54,7 @@ class View:
                 tags=len(self.tags),
                 rays_per_side=rays,
                 max_degrees=degrees,
-                length=20.0,
+                length=RAY_LENGTH,
                 radius=CAST_RADIUS,
                 start_offset=CAST_HEIGHT,
                 end_offset=CAST_HEIGHT,
@@ -69,57 +72,120 @@ class SoccerView:
     ) -> None:
         """`yaw`: the scene's array float64 [A, F]; `views`: one a behavior; `agent_tags`: one an agent."""
         self._physics, self._yaw = physics, yaw
-        self._sensors = [view.sensors() for view in views]
-        self._angles = [np.concatenate([eyes.angles for eyes in sensors]) for sensors in self._sensors]
+        self._views = [_Rays(view) for view in views]
         walls = list(_walls(physics.pitch.blue_closed))
-        self._walls = Faces(np.array([wall.begin for wall in walls]), np.array([wall.end for wall in walls]))
-        self._num_walls = len(walls)
+        self._walls = Walls(
+            np.array([wall.begin for wall in walls]), np.array([wall.end for wall in walls]), CAST_RADIUS
+        )
         owned = [(edge, number) for number, wall in enumerate(walls) for edge in wall.edges]
-        self._edges, self._owner = np.array([edge for edge, _ in owned]), np.array([n for _, n in owned])
+        self._edges = np.array([edge for edge, _ in owned]).T[:, :, None]  # [2, C, 1]
+        self._owner = np.array([n for _, n in owned])
         radius = np.array([BALL_RADIUS] + [AGENT_RADIUS] * len(agent_tags))
-        self._reach = np.full(len(radius) + len(owned), CAST_RADIUS)  # bodies, edges
-        self._reach[: len(radius)] = np.sqrt((radius + CAST_RADIUS) ** 2 - CAST_HEIGHT**2)
+        self._num_bodies, self._num_discs = len(radius), len(radius) + len(owned)
+        self._reach = np.full((self._num_discs, 1), CAST_RADIUS)  # bodies, edges
+        self._reach[: len(radius), 0] = np.sqrt((radius + CAST_RADIUS) ** 2 - CAST_HEIGHT**2)
         tags = ["ball", *agent_tags, *(walls[owner].tag for _, owner in owned), *(wall.tag for wall in walls)]
-        self._tags = [
-            np.array([view.tags.index(tag) if tag in view.tags else -1 for tag in tags]) for view in views
-        ]
+        self._columns = np.array([rays.columns(tags) for rays in self._views])
+        self._layouts: dict[tuple[int, ...], _Layout] = {}
 
-    def frames(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
-        """Return one frame float32 [n, R * (tags + 2)] a sensor of `slots` [n], agents of `behavior`."""
-        field, agent = np.divmod(slots, len(self._yaw))
-        position = self._physics.position
-        heading = self._yaw[agent, field][:, None] + self._angles[behavior]
-        direction = np.stack([np.sin(heading), np.cos(heading)], axis=-1)[:, :, None]
-        distance = self._cast(position[:, 1 + agent, field].T, direction, position[:, :, field].T)
-        sensors = self._sensors[behavior]
-        encoded = sensors[0].encode(distance, self._tags[behavior]).reshape(len(slots), -1)
-        frames, first = [], 0
-        for eyes in sensors:
-            frames.append(encoded[:, first : first + eyes.size])
-            first += eyes.size
-        return frames
+    def frames(self, slots: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
+        """Return one frame float32 [n, R * (tags + 2)] a sensor, of `slots` [n] of each behavior.
 
-    def _cast(self, origin: np.ndarray, direction: np.ndarray, bodies: np.ndarray) -> np.ndarray:
-        """Return distances in m, inf where nothing is met, [n, R, B + C + P]: bodies, edges, walls.
-
-        `origin` [n, 2]; unit `direction` [n, R, 1, 2]; `bodies` [n, B, 2]. A wall that the caster touches
-        is not seen at all; its edges are edges of the same collider.
+        All in one go: what a cast costs depends little on the number of rays.
         """
-        num_bodies, num_discs = bodies.shape[1], len(self._reach)
-        discs = np.empty((len(origin), 1, num_discs, 2))
-        discs[:, 0, :num_bodies] = bodies
-        discs[:, 0, num_bodies:] = self._edges
-        distance = np.empty((*direction.shape[:2], num_discs + self._num_walls))
-        origin = origin[:, None, None]
-        distance[:, :, :num_discs] = cast_spheres(origin, direction, discs, self._reach)
-        distance[:, :, num_discs:] = self._walls.cast(origin, direction, CAST_RADIUS)
-        touched = self._walls.touches(origin, CAST_RADIUS + TOUCH)[:, 0]
-        row, wall = np.nonzero(touched)
-        if row.size:
-            distance[row, :, num_discs + wall] = np.inf
-            row, edge = np.nonzero(touched[:, self._owner])
-            distance[row, :, num_bodies + edge] = np.inf
-        return distance
+        layout = self._layout(tuple(map(len, slots)))
+        field, agent = np.divmod(np.concatenate(slots), len(self._yaw))
+        yaw = np.split(self._yaw[agent, field], layout.ends)
+        heading = [(own[:, None] + rays.angles).ravel() for own, rays in zip(yaw, self._views, strict=True)]
+        travel = self._cast(agent, field, np.concatenate(heading), layout.caster)
+        nearest = first_met(travel)
+        numbers = np.zeros(layout.size, np.float32)
+        numbers[layout.first + self._columns.take(layout.columns + nearest)] = 1.0
+        share = travel.take(nearest * len(layout.caster) + layout.every) / RAY_LENGTH
+        numbers[layout.last] = np.minimum(share, 1.0)
+        return layout.split(numbers, self._views)
+
+    def _cast(
+        self, agent: np.ndarray, field: np.ndarray, heading: np.ndarray, caster: np.ndarray
+    ) -> np.ndarray:
+        """Return travels [B + C + P + 1, R] of rays: to bodies, edges, walls, and to just beyond their ends.
+
+        `agent`, `field` [n]: who casts; `heading` [R] rad; `caster` [R]: whose ray it is, 0 to n - 1. A
+        wall that the caster touches is not seen at all; its edges are edges of the same collider.
+        """
+        bodies, discs = self._num_bodies, self._num_discs
+        position = self._physics.position
+        origin = position[:, 1 + agent, field]
+        towards = np.empty((3, discs, len(agent)))  # x, z, and what is beyond the reach
+        np.subtract(position.take(field, 2), origin[:, None], out=towards[:2, :bodies])
+        np.subtract(self._edges, origin[:, None], out=towards[:2, bodies:])
+        towards[2] = unmet_discs(towards[:2], self._reach)
+        places = self._walls.places(origin)
+        touched = self._walls.touched(places, TOUCH)
+        places[0, touched | (places[0] < 0)] = np.nan
+        towards[2, bodies:][touched[self._owner]] = np.inf
+        towards, places = towards.take(caster, 2), places.take(caster, 2)
+        direction = np.stack([np.sin(heading), np.cos(heading)])
+        travel = np.empty((discs + places.shape[1] + 1, len(heading)))
+        travel[:discs] = cast_discs(towards[:2], towards[2], direction)
+        travel[discs:-1] = self._walls.cast(places, direction)
+        travel[-1] = _BEYOND
+        return travel
+
+    def _layout(self, counts: tuple[int, ...]) -> _Layout:
+        if counts not in self._layouts:
+            self._layouts[counts] = _Layout(counts, self._views, self._columns.shape[1])
+        return self._layouts[counts]
+
+
+class _Rays:
+    """The rays of the agents of one behavior: angles in rad [R], numbers a ray, sizes of sensors."""
+
+    def __init__(self, view: View) -> None:
+        sensors = view.sensors()
+        self.tags = view.tags
+        self.angles = np.concatenate([eyes.angles for eyes in sensors])
+        self.numbers = len(view.tags) + 2
+        self.sizes = [eyes.size for eyes in sensors]
+
+    def columns(self, tags: Sequence[str]) -> list[int]:
+        """Return which of a ray's numbers is 1 when it meets a collider of `tags` first, or none at all.
+
+        For tags that are not listed it is the last one, where the distance is put afterwards.
+        """
+        listed = [self.tags.index(tag) if tag in self.tags else self.numbers - 1 for tag in tags]
+        return [*listed, self.numbers - 2]
+
+
+class _Layout:
+    """Where the numbers of all rays are, for some number of agents of each behavior.
+
+    [R] each: `caster`, whose ray it is; `first` and `last` place of its numbers; `columns`, where the row
+    of its behavior begins in a table of `num_columns` columns; `every`, 0 to R - 1.
+    """
+
+    def __init__(self, counts: Sequence[int], views: Sequence[_Rays], num_columns: int) -> None:
+        rays = [len(view.angles) for view in views]
+        behavior = np.repeat(np.arange(len(views)), np.multiply(counts, rays))
+        numbers = np.array([view.numbers for view in views])[behavior]
+        self.counts, self.ends = counts, np.cumsum(counts)[:-1]
+        self.caster = np.repeat(np.arange(sum(counts)), np.repeat(rays, counts))
+        self.columns = behavior * num_columns
+        self.every = np.arange(len(behavior))
+        self.size = int(numbers.sum())
+        self.last = np.cumsum(numbers) - 1
+        self.first = self.last - (numbers - 1)
+
+    def split(self, numbers: np.ndarray, views: Sequence[_Rays]) -> list[list[np.ndarray]]:
+        """Return the sensors' parts of all numbers, views [n, size] a sensor, by behavior."""
+        frames, begin = [], 0
+        for count, view in zip(self.counts, views, strict=True):
+            size = sum(view.sizes)
+            block = numbers[begin : begin + count * size].reshape(count, size)
+            begin += count * size
+            ends = np.cumsum(view.sizes)
+            frames.append([block[:, end - own : end] for end, own in zip(ends, view.sizes, strict=True)])
+        return frames
 
 
 @dataclass(frozen=True)

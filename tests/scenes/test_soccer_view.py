@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.rays import Faces, cast_rectangles
+from mappo_unity.scenes.rays import cast_rectangles, cast_spheres
 from mappo_unity.scenes.soccer import PURPLE, SoccerScene, SoccerTwos, StrikersVsGoalie
+from mappo_unity.scenes.soccer_casts import Walls, cast_discs, first_met, unmet_discs
 
 BALL_REACH = np.sqrt(1.1241719**2 - 0.25)  # 1.007: radii of ball and cast, centres 0.5 m apart in height
 AGENT_REACH = np.sqrt(0.75)
@@ -156,21 +157,20 @@ def test_strikers_see_the_goalie_and_the_purple_goal() -> None:
     assert seen(rays(env, 0)[0][0]) == (3, pytest.approx(3 - AGENT_REACH, abs=1e-5))
 
 
-def test_faces_agree_with_boxes_seen_from_their_front() -> None:
+def test_walls_agree_with_boxes_seen_from_their_front() -> None:
     rng = np.random.default_rng(0)
     centre, half = np.array([3.0, 1.0]), np.array([0.25, 4.0])
-    turns = rng.uniform(-0.5, 0.5, 50)
     hits = 0
-    for yaw in turns:
+    for yaw in rng.uniform(-0.5, 0.5, 50):
         right, along = np.array([np.cos(yaw), -np.sin(yaw)]), np.array([np.sin(yaw), np.cos(yaw)])
         begin, end = centre - half[0] * right + half[1] * along, centre - half[0] * right - half[1] * along
-        origin = rng.uniform(-2, 0, (20, 1, 2))
-        heading = rng.uniform(-1, 4, (20, 1))
+        origin = rng.uniform(-2, 0, (20, 2))
+        heading = rng.uniform(-1, 4, 20)
         direction = np.stack([np.sin(heading), np.cos(heading)], axis=-1)
-        faces = Faces(begin[None], end[None])
-        way = faces.cast(origin, direction, 0.5)
+        wall = Walls(begin[None], end[None], 0.5)
+        way = wall.cast(wall.places(origin.T), direction.T)[0]
         box = cast_rectangles(origin, direction, 0.5, centre, half, yaw)
-        met = np.isfinite(way)
+        met = way >= 0
         hits += int(met.sum())
         assert way[met] == pytest.approx(box[met], abs=1e-9)
         at = (origin + np.where(np.isfinite(box), box, 0)[..., None] * direction - centre) @ along
@@ -178,7 +178,22 @@ def test_faces_agree_with_boxes_seen_from_their_front() -> None:
     assert hits > 200
 
 
-def test_touches_faces_and_their_ends() -> None:
-    faces = Faces(np.array([[0.0, 0.0]]), np.array([[2.0, 0.0]]))
-    points = np.array([[1.0, -0.49], [1.0, 0.51], [2.3, 0.3], [2.4, 0.4], [-0.49, 0.0]])[:, None]
-    assert faces.touches(points, 0.5)[:, 0].tolist() == [True, False, True, False, True]
+def test_touched_walls_and_their_ends() -> None:
+    walls = Walls(np.array([[0.0, 0.0]]), np.array([[2.0, 0.0]]), radius=0.4)
+    points = np.array([[1.0, -0.49], [1.0, 0.51], [2.3, 0.3], [2.4, 0.4], [-0.49, 0.0]])
+    assert walls.touched(walls.places(points.T), 0.1)[0].tolist() == [True, False, True, False, True]
+
+
+def test_cast_discs_agree_with_spheres_and_the_nearest_is_first() -> None:
+    rng = np.random.default_rng(1)
+    origin, centre = rng.uniform(-5, 5, (300, 1, 2)), rng.uniform(-5, 5, (8, 2))
+    heading = rng.uniform(-4, 4, 300)
+    direction = np.stack([np.sin(heading), np.cos(heading)])
+    expected = cast_spheres(origin, direction.T[:, None], centre, 1.5).T
+    towards = (centre - origin).transpose(2, 1, 0)
+    way = cast_discs(towards, unmet_discs(towards, np.full((8, 1), 1.5)), direction)
+    met = np.isfinite(expected)
+    assert way[met] == pytest.approx(expected[met]) and not (way[~met] >= 0).any()
+    some = met.any(axis=0)
+    assert 100 < some.sum() < 300
+    assert np.array_equal(first_met(way)[some], expected.argmin(axis=0)[some])
