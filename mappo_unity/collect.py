@@ -29,7 +29,8 @@ def make_collector(env: EnvBase, policy: JointPolicy, rounds: int, device: str =
         total_frames=-1,
         exploration_type=ExplorationType.RANDOM,
         track_traj_ids=False,
-        use_buffers=False,
+        use_buffers=False,  # a batch is a new stack of its rounds,
+        return_same_td=device == "cpu",  # so that nothing has to be copied out of it
         trust_policy=True,
         auto_register_policy_transforms=False,
         **devices,

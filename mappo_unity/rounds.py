@@ -119,7 +119,8 @@ class BehaviorRounds:
         size = self.spec.action_spec.continuous_size
         out = ActionTuple()
         if size:
-            out.add_continuous(np.clip(rows[:, :size], -limit, limit).astype(np.float32) / np.float32(limit))
+            clipped = np.minimum(np.maximum(rows[:, :size], -limit), limit)
+            out.add_continuous(clipped.astype(np.float32, copy=False) / np.float32(limit))
         if self.spec.action_spec.discrete_size:
             out.add_discrete(rows[:, size:].astype(np.int32))
         return out

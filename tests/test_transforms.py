@@ -188,6 +188,16 @@ def test_batches_are_those_of_torchrl(script, device):
     assert_same(batches[:1], batches[1:])
 
 
+def test_a_batch_stays_as_it_was_while_the_next_is_collected():
+    env = transformed(scene("3DBall"))
+    batches = iter(make_collector(env, policy_of(env), 5))
+    first = next(batches)
+    kept = first.clone()
+    assert_same([first], [kept])
+    next(batches)
+    assert_same([first], [kept])
+
+
 def policy_of(env):
     """Return small actors for an environment, always the same."""
     torch.manual_seed(1)
