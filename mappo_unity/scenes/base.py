@@ -87,6 +87,7 @@ class Scene(BaseEnv):
         for name, value in parameters.items():
             self.parameters[name] = checked_parameter(self.NAME, self.PARAMETERS, name, value)
         self._specs = [behavior.spec() for behavior in self.BEHAVIORS]
+        self._branch_sizes = [np.array(behavior.branches, np.int32) for behavior in self.BEHAVIORS]
         self._index = {behavior.name: i for i, behavior in enumerate(self.BEHAVIORS)}
         self.agents = Agents(
             np.tile(np.array(self.AREA_BEHAVIORS), self.num_areas),
@@ -454,11 +455,10 @@ class Scene(BaseEnv):
         spec: BehaviorSpec = self._specs[behavior]
         spec.action_spec._validate_action(action, count, declared.name)
         continuous, discrete = action.continuous, action.discrete
-        bad = ~np.isfinite(continuous).all(axis=1)
-        if declared.branches:
-            bad |= ((discrete < 0) | (discrete >= np.array(declared.branches))).any(axis=1)
-        if bad.any():
-            row = int(np.flatnonzero(bad)[0])
+        bad = ~np.isfinite(continuous)
+        outside = (discrete < 0) | (discrete >= self._branch_sizes[behavior])
+        if np.count_nonzero(bad) or np.count_nonzero(outside):
+            row = int(np.flatnonzero(bad.any(axis=1) | outside.any(axis=1))[0])
             raise UnityActionException(
                 f"action of agent {int(self.agents.agent_id[slots[row]])} of {declared.name} is invalid: "
                 f"continuous {continuous[row].tolist()} must be finite, discrete {discrete[row].tolist()} "

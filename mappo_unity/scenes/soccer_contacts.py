@@ -18,7 +18,8 @@ RESTITUTION = 0.8  # of the ball with anything; agents have none
 BOUNCE_SPEED = np.array(2.0)  # m/s: slower approaches do not bounce
 ITERATIONS = 6
 _SETTLED = 1e-9  # kg m/s: an iteration that changes less ends the solve
-_ZERO, _ONE = np.array(0.0), np.array(1.0)  # NumPy takes arrays twice as fast as Python's numbers
+# as arrays: NumPy takes those twice as fast as Python's numbers
+_ZERO, _ONE, _SINGLE = np.array(0.0), np.array(1.0), np.array(1)
 
 
 class Contacts(NamedTuple):
@@ -56,7 +57,7 @@ class Bodies:
         # the velocities one after another, and at the same places the inverse masses that weigh impulses
         self.flat_velocity = self.velocity.reshape(-1)
         self.flat_weight = np.tile(self.constants[0], 2)
-        self.axes = np.array([[0], [num]])  # where x and z begin
+        self.num = np.array(num)
 
     def solve(self, contacts: Contacts, tick_s: float) -> Solved:
         """Stop or bounce approaching pairs and rub them."""
@@ -70,7 +71,7 @@ class Solved:
 
     def __init__(self, bodies: Bodies, contacts: Contacts, tick_s: float) -> None:
         self._all = _Rows(bodies, contacts, tick_s)
-        shared = _shared(contacts, len(bodies.spin))
+        shared = _shared(contacts, len(bodies.spin) - 1)
         self._alone, self._ranks = self._all, []
         if shared is not None:
             self._alone = self._all.part(np.flatnonzero(~shared))
@@ -100,11 +101,11 @@ class Solved:
         self.repeat(lambda part: part.push(flat))
 
 
-def _shared(contacts: Contacts, num_bodies: int) -> np.ndarray | None:
+def _shared(contacts: Contacts, pitch: int) -> np.ndarray | None:
     """Return which contacts have a body in common with another one, the pitch excepted; None: none has."""
-    count = np.bincount(contacts.bodies.reshape(-1), minlength=num_bodies)
-    count[-1] = 0
-    many = count > 1
+    count = np.bincount(contacts.bodies.reshape(-1), minlength=pitch + 1)
+    count[pitch] = 0
+    many = count > _SINGLE
     if not np.count_nonzero(many):
         return None
     first, second = many[contacts.bodies]
@@ -135,7 +136,9 @@ class _Rows:
         self.tangent = np.empty_like(self.normal)
         np.negative(self.normal[1], out=self.tangent[0])
         self.tangent[1] = self.normal[0]
-        self.places = pair[:, None] + bodies.axes  # of the velocities [2, 2, n]
+        self.places = np.empty((2, *pair.shape), np.int64)  # of the velocities [2, 2, n]
+        self.places[:, 0] = pair
+        np.add(pair, bodies.num, out=self.places[:, 1])
         self.weight = bodies.flat_weight.take(self.places)
         _, rub_weight, self.lever, self.spin_gain = bodies.constants.take(self.first, 1)
         weight_i, weight_j = self.weight[:, 0]

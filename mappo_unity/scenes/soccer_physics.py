@@ -16,7 +16,16 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.scenes.soccer_contacts import Bodies, Contacts, Solved
-from mappo_unity.scenes.soccer_pitch import BALL_HEIGHT, GOAL_FLOOR_X, MARGIN, POST_X, Faced, Gaps, Pitch
+from mappo_unity.scenes.soccer_pitch import (
+    BALL_HEIGHT,
+    GOAL_FLOOR_X,
+    MARGIN,
+    NUM_FEATURES,
+    POST_X,
+    Faced,
+    Gaps,
+    Pitch,
+)
 
 TICK_S = 0.02
 AGENT_RADIUS, AGENT_MASS = 0.5, 50.0  # m, kg
@@ -62,6 +71,7 @@ class SoccerPhysics:
         self.touching = np.zeros((num_agents, num_fields), bool)
         radius = np.where(np.arange(bodies[0]) == 0, BALL_RADIUS, AGENT_RADIUS)
         self._radius = np.repeat(radius, num_fields)
+        self._radii = np.tile(self._radius, (NUM_FEATURES, 1))
         self._no_goals = np.zeros(num_fields, np.int64)
         self._gaps: Gaps | None = None  # of `position`; None: bodies were placed or stopped since
         self._first, self._second = np.array(list(combinations(range(bodies[0]), 2))).T
@@ -131,7 +141,7 @@ class SoccerPhysics:
             parts.append(self._pairs(close, away, squared))
         at = self._flat(position)
         if self._gaps is None:
-            self._gaps = self.pitch.gaps(at, self._radius)
+            self._gaps = self.pitch.gaps(at, self._radii)
         faced = self.pitch.contacts(at, self._gaps)
         if faced.disc.size:
             parts.append(self._with_pitch(faced))
@@ -173,7 +183,7 @@ class SoccerPhysics:
         A body that was in contact at the start slides on instead of losing the rest of its way.
         """
         begin, end = self._flat(start), self._flat(self.position)
-        before, self._gaps = self._gaps, self.pitch.gaps(end, self._radius)
+        before, self._gaps = self._gaps, self.pitch.gaps(end, self._radii)
         assert before is not None
         hits, share = self.pitch.way(begin, end, before, self._gaps, self._radius)
         if not hits.disc.size:

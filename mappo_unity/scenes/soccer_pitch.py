@@ -30,10 +30,14 @@ GOAL_FLOOR_X, GOAL_FLOOR_Z = 15.5, 4.25  # front edge and half-width of the goal
 BALL_HEIGHT = 0.5  # of the ball's centre above the goals' floors
 BLOCK_X, BLOCK_Z = 15.01, 3.957  # inner face and half-width of the block that closes a blue goal
 _ROUNDING = 1e-6  # m: a disc less deep than this has not hit anything
-_SIDE, _CORNER, _NET, _EDGE, _BACK = range(5)  # features: long side, corner wall, net's side, its front, back
+NUM_FEATURES = 5
+_SIDE, _CORNER, _NET, _EDGE, _BACK = range(
+    NUM_FEATURES
+)  # features: long side, corner wall, net's side, its front, back
 _NORMAL = np.array([[0.0, -_C, 0.0, 0.0, -1.0], [-1.0, -_S, -1.0, 0.0, 0.0]])
 # as arrays: NumPy takes those twice as fast as Python's numbers
-_ZERO, _ONE, _MARGIN, _DEEP = np.array(0.0), np.array(1.0), np.array(MARGIN), np.array(-_ROUNDING)
+_ZERO, _ONE, _INF = np.array(0.0), np.array(1.0), np.array(np.inf)
+_MARGIN, _DEEP = np.array(MARGIN), np.array(-_ROUNDING)
 _COS, _SIN, _CORNER_STOP = np.array(_C), np.array(_S), np.array(CORNER_END)
 _SIDE_GAP, _CORNER_GAP, _NET_GAP = np.array(SIDE_Z), np.array(CORNER_OFFSET), np.array(NET_Z)
 
@@ -74,22 +78,25 @@ class Pitch:
         self._ends = np.array(ends).T.copy()
 
     def gaps(self, at: np.ndarray, radius: np.ndarray) -> Gaps:
-        """Return the distances from everything that they face of n discs `at` x, z [2, n]."""
+        """Return the distances from everything that they face of n discs `at` x, z [2, n].
+
+        `radius` [5, n]: the discs' radii, once for each feature.
+        """
         folded = np.abs(at)
         x, z = folded
         ends = self._ends.take(at[0] > _ZERO, 1)
         along = folded - ends[:2]
         squares = along * along
-        gap = np.empty((5, len(x)))
+        gap = np.empty((NUM_FEATURES, len(x)))
         np.subtract(_SIDE_GAP, z, out=gap[_SIDE])
         np.subtract(_CORNER_GAP, _COS * x + _SIN * z, out=gap[_CORNER])
         np.subtract(_NET_GAP, z, out=gap[_NET])
         np.sqrt(squares[0] + squares[1], out=gap[_EDGE])
         np.subtract(ends[3], x, out=gap[_BACK])
         in_net = x > ends[2]
-        gap[_NET, ~in_net] = np.inf
-        gap[_EDGE, in_net | (z < ends[5])] = np.inf
-        gap[_BACK, z >= ends[4]] = np.inf
+        np.putmask(gap[_NET], ~in_net, _INF)
+        np.putmask(gap[_EDGE], in_net | (z < ends[5]), _INF)
+        np.putmask(gap[_BACK], z >= ends[4], _INF)
         gap -= radius
         return Gaps(gap, _SIN * x - _COS * z <= _CORNER_STOP)
 
@@ -97,8 +104,7 @@ class Pitch:
         """Return the contacts of n discs with walls, nets and block: all gaps below 0.02 m."""
         close = gaps.gap < _MARGIN
         close[_CORNER] &= gaps.beside_corner
-        feature, disc = close.nonzero()
-        return self._faced(feature, disc, at, gaps.gap[feature, disc])
+        return self._faced(close, at, gaps.gap)
 
     def way(
         self, start: np.ndarray, end: np.ndarray, before: Gaps, after: Gaps, radius: np.ndarray
@@ -118,9 +124,7 @@ class Pitch:
             return _NOTHING, _NOTHING.gap
         edge = np.flatnonzero(hit[_EDGE])
         hit[_EDGE] = False
-        feature, disc = hit.nonzero()
-        faced = self._faced(feature, disc, end, after.gap[feature, disc])
-        faced, share = _ends(faced, start, end)
+        faced, share = _ends(self._faced(hit, end, after.gap), start, end)
         if edge.size:
             edges, until = self._edge_ways(edge, start, end, radius)
             faced, share = _joined(faced, edges), np.concatenate([share, until])
@@ -149,8 +153,10 @@ class Pitch:
         """Return where the front edge of the mouth is at the ends of `x` [k], folded, [2, k]."""
         return self._ends[:2].take(x > 0, 1)
 
-    def _faced(self, feature: np.ndarray, disc: np.ndarray, at: np.ndarray, gap: np.ndarray) -> Faced:
-        """Return features with their normals, given their gaps [k] and the positions of all discs."""
+    def _faced(self, faced: np.ndarray, at: np.ndarray, gap: np.ndarray) -> Faced:
+        """Return features with their normals: those `faced` [5, n] by the discs `at` x, z [2, n]."""
+        (places,) = faced.reshape(-1).nonzero()  # much faster than two-dimensional
+        feature, disc = np.divmod(places, faced.shape[1])
         at = at.take(disc, 1)
         normal = _NORMAL.take(feature, 1)
         edge = (feature == _EDGE).nonzero()[0]
@@ -158,7 +164,7 @@ class Pitch:
             at_edge = at[:, edge]
             normal[:, edge] = _unit(np.abs(at_edge) - self._edge(at_edge[0]))
         normal *= np.copysign(_ONE, at)
-        return Faced(disc, normal, gap)
+        return Faced(disc, normal, gap.take(places))
 
     def _edge_ways(
         self, disc: np.ndarray, start: np.ndarray, end: np.ndarray, radius: np.ndarray

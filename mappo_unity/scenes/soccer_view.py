@@ -95,15 +95,17 @@ class SoccerView:
         """
         layout = self._layout(tuple(map(len, slots)))
         field, agent = np.divmod(np.concatenate(slots), len(self._yaw))
-        yaw = np.split(self._yaw[agent, field], layout.ends)
-        heading = [(own[:, None] + rays.angles).ravel() for own, rays in zip(yaw, self._views, strict=True)]
-        travel = self._cast(agent, field, np.concatenate(heading), layout.caster)
+        heading = self._yaw[agent, field].take(layout.caster) + layout.angles
+        travel = self._cast(agent, field, heading, layout.caster)
         nearest = first_met(travel)
         numbers = np.zeros(layout.size, np.float32)
         numbers[layout.first + self._columns.take(layout.columns + nearest)] = 1.0
-        share = travel.take(nearest * len(layout.caster) + layout.every) / RAY_LENGTH
+        share = travel.take(nearest * len(heading) + layout.every) / RAY_LENGTH
         numbers[layout.last] = np.minimum(share, 1.0)
-        return layout.split(numbers, self._views)
+        return [
+            [numbers[begin:end].reshape(shape)[:, columns] for columns in sensors]
+            for begin, end, shape, sensors in layout.blocks
+        ]
 
     def _cast(
         self, agent: np.ndarray, field: np.ndarray, heading: np.ndarray, caster: np.ndarray
@@ -139,14 +141,16 @@ class SoccerView:
 
 
 class _Rays:
-    """The rays of the agents of one behavior: angles in rad [R], numbers a ray, sizes of sensors."""
+    """The rays of an agent of one behavior: angles in rad, numbers a ray and in all, sensors' slices."""
 
     def __init__(self, view: View) -> None:
         sensors = view.sensors()
         self.tags = view.tags
         self.angles = np.concatenate([eyes.angles for eyes in sensors])
         self.numbers = len(view.tags) + 2
-        self.sizes = [eyes.size for eyes in sensors]
+        ends = np.cumsum([eyes.size for eyes in sensors]).tolist()
+        self.size = ends[-1]
+        self.sensors = [slice(end - eyes.size, end) for end, eyes in zip(ends, sensors, strict=True)]
 
     def columns(self, tags: Sequence[str]) -> list[int]:
         """Return which of a ray's numbers is 1 when it meets a collider of `tags` first, or none at all.
@@ -160,32 +164,30 @@ class _Rays:
 class _Layout:
     """Where the numbers of all rays are, for some number of agents of each behavior.
 
-    [R] each: `caster`, whose ray it is; `first` and `last` place of its numbers; `columns`, where the row
-    of its behavior begins in a table of `num_columns` columns; `every`, 0 to R - 1.
+    [R] each: `caster`, whose ray it is; `angles`, rad; `first` and `last` place of its numbers; `columns`,
+    where the row of its behavior begins in a table of `num_columns` columns; `every`, 0 to R - 1.
+    `blocks`: a behavior's begin, end, shape, and slices of its sensors.
     """
 
     def __init__(self, counts: Sequence[int], views: Sequence[_Rays], num_columns: int) -> None:
         rays = [len(view.angles) for view in views]
         behavior = np.repeat(np.arange(len(views)), np.multiply(counts, rays))
         numbers = np.array([view.numbers for view in views])[behavior]
-        self.counts, self.ends = counts, np.cumsum(counts)[:-1]
         self.caster = np.repeat(np.arange(sum(counts)), np.repeat(rays, counts))
+        self.angles = np.concatenate(
+            [np.tile(view.angles, count) for view, count in zip(views, counts, strict=True)]
+        )
         self.columns = behavior * num_columns
         self.every = np.arange(len(behavior))
         self.size = int(numbers.sum())
         self.last = np.cumsum(numbers) - 1
         self.first = self.last - (numbers - 1)
-
-    def split(self, numbers: np.ndarray, views: Sequence[_Rays]) -> list[list[np.ndarray]]:
-        """Return the sensors' parts of all numbers, views [n, size] a sensor, by behavior."""
-        frames, begin = [], 0
-        for count, view in zip(self.counts, views, strict=True):
-            size = sum(view.sizes)
-            block = numbers[begin : begin + count * size].reshape(count, size)
-            begin += count * size
-            ends = np.cumsum(view.sizes)
-            frames.append([block[:, end - own : end] for end, own in zip(ends, view.sizes, strict=True)])
-        return frames
+        shapes = [(count, view.size) for count, view in zip(counts, views, strict=True)]
+        ends = np.cumsum([count * size for count, size in shapes])
+        self.blocks = [
+            (end - shape[0] * shape[1], end, shape, view.sensors)
+            for end, shape, view in zip(ends.tolist(), shapes, views, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
