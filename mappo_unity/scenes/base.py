@@ -431,6 +431,8 @@ class Scene(BaseEnv):
         self._asked = slots
         if slots is self.agents.order:
             self._asked_rows = [self.agents.members(i) for i in range(len(self.BEHAVIORS))]
+        elif not slots.size:
+            self._asked_rows = [slots] * len(self.BEHAVIORS)
         else:
             self._asked_rows = [slots[self.agents.behavior[slots] == i] for i in range(len(self.BEHAVIORS))]
 

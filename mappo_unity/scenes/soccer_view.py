@@ -124,8 +124,8 @@ class SoccerView:
         towards[2] = unmet_discs(towards[:2], self._reach)
         places = self._walls.places(origin)
         touched = self._walls.touched(places, TOUCH)
-        places[0, touched | (places[0] < 0)] = np.nan
-        towards[2, bodies:][touched[self._owner]] = np.inf
+        np.putmask(places[0], touched | (places[0] < 0), np.nan)
+        np.putmask(towards[2, bodies:], touched.take(self._owner, 0), np.inf)
         towards, places = towards.take(caster, 2), places.take(caster, 2)
         direction = np.stack([np.sin(heading), np.cos(heading)])
         travel = np.empty((discs + places.shape[1] + 1, len(heading)))
