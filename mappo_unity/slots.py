@@ -113,3 +113,10 @@ class SlotTable:
         self.team_key = np.array(state["team_key"], np.int64)
         self._slot_of = {int(a): s for s, a in enumerate(self.agent_id.tolist()) if a != FREE}
         self._last_ids = self._last_slots = np.zeros(0, np.int64)
+
+
+def count_teams(agent_ids: np.ndarray, group_ids: np.ndarray) -> tuple[int, int]:
+    """Return how many teams these agents form and how large the largest is."""
+    groups, counts = np.unique(group_ids[group_ids > 0], return_counts=True)
+    alone = int((group_ids <= 0).sum())
+    return max(1, len(groups) + alone), max(1, int(counts.max(initial=1)))

@@ -19,13 +19,13 @@ import numpy as np
 import torch
 from mlagents_envs.base_env import BaseEnv
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Binary, Bounded, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
 from mappo_unity import keys
 from mappo_unity.config import ConfigError
 from mappo_unity.rounds import BehaviorRounds, Episode
-from mappo_unity.slots import SlotTable
+from mappo_unity.slots import SlotTable, count_teams
+from mappo_unity.specs import make_specs
 
 MAX_SILENT_STEPS = 100_000  # BaseEnv steps in which nobody asks before that is called an error
 
@@ -69,7 +69,8 @@ class UnityEnv(EnvBase):
         self.action_limit = float(action_limit)
         self.death_masking = death_masking
         self._open(seed)
-        self._make_specs()
+        specs = make_specs(self._behaviors, self.entry_of, self.action_limit)
+        self.observation_spec, self.action_spec, self.reward_spec, self.done_spec = specs
 
     # --- what a trainer asks for beyond EnvBase
 
@@ -178,9 +179,7 @@ class UnityEnv(EnvBase):
             if step_first or attempt:
                 self.base_env.step()
             asked = False
-            cut_off = getattr(
-                self.base_env, "cut_off", None
-            )  # a restarted player's agents, see link.restarts
+            cut_off = getattr(self.base_env, "cut_off", None)  # a restarted player's, see link.restarts
             for name, behavior in self._behaviors.items():
                 decision, terminal = self.base_env.get_steps(name)
                 if cut_off and name in cut_off:
@@ -225,7 +224,7 @@ class UnityEnv(EnvBase):
         sizes: dict[str, tuple[int, int]] = {}
         for name in names:
             policy = keys.policy_name(name)
-            teams, members = _count_teams(decisions[name].agent_id, decisions[name].group_id)
+            teams, members = count_teams(decisions[name].agent_id, decisions[name].group_id)
             seen = sizes.get(policy, (1, 1))
             sizes[policy] = max(seen[0], teams), max(seen[1], members)
         for name in names:
@@ -292,35 +291,6 @@ class UnityEnv(EnvBase):
             out[self.entry_of[name]] = unchecked(entries, shape)
         return unchecked(out, self.batch_size)
 
-    def _make_specs(self) -> None:
-        observation, action, reward, done = {}, {}, {}, {}
-        for behavior_name, behavior in self._behaviors.items():
-            name, shape = self.entry_of[behavior_name], self._shape(behavior)
-            entries: dict[str, Any] = {
-                keys.SENSOR.format(i): Unbounded((*shape, *o.shape[1:])) for i, o in enumerate(behavior.obs)
-            }
-            for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED):
-                entries[key] = Binary(1, (*shape, 1), dtype=torch.bool)
-            if behavior.mask.shape[1]:
-                entries[keys.MASK] = Binary(
-                    behavior.mask.shape[1], (*shape, behavior.mask.shape[1]), dtype=torch.bool
-                )
-            observation[name] = Composite(entries, shape=shape)
-            action[name] = Composite(
-                {keys.ACTION: _action_spec(behavior, shape, self.action_limit)}, shape=shape
-            )
-            rewards = {key: Unbounded((*shape, 1)) for key in (keys.REWARD, keys.GROUP_REWARD)}
-            reward[name] = Composite(rewards, shape=shape)
-            ends = {
-                key: Binary(1, (*shape, 1), dtype=torch.bool)
-                for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
-            }
-            done[name] = Composite(ends, shape=shape)
-        self.observation_spec = Composite(observation)
-        self.action_spec = Composite(action)
-        self.reward_spec = Composite(reward)
-        self.done_spec = Composite(done)
-
 
 def unchecked(entries: dict[str, Any], shape: torch.Size, device: torch.device | None = None) -> TensorDict:
     """Return entries that are known to fit a shape as a TensorDict.
@@ -328,22 +298,3 @@ def unchecked(entries: dict[str, Any], shape: torch.Size, device: torch.device |
     The checks of TensorDict's constructor take ten times as long as its work, several times a round.
     """
     return TensorDict._new_unsafe(entries, shape, device)
-
-
-def _count_teams(agent_ids: np.ndarray, group_ids: np.ndarray) -> tuple[int, int]:
-    """Return how many teams these agents form and how large the largest is."""
-    groups, counts = np.unique(group_ids[group_ids > 0], return_counts=True)
-    alone = int((group_ids <= 0).sum())
-    return max(1, len(groups) + alone), max(1, int(counts.max(initial=1)))
-
-
-def _action_spec(behavior: BehaviorRounds, shape: torch.Size, limit: float) -> Any:
-    spec = behavior.spec.action_spec
-    size, branches = spec.continuous_size, spec.discrete_branches
-    if not branches:
-        return Bounded(-limit, limit, (*shape, size), dtype=torch.float32)
-    if not size:
-        return MultiCategorical(branches, (*shape, len(branches)), dtype=torch.int64)
-    low = torch.tensor([-limit] * size + [0.0] * len(branches)).expand(*shape, -1)
-    high = torch.tensor([limit] * size + [n - 1e-3 for n in branches]).expand(*shape, -1)
-    return Bounded(low.clone(), high.clone(), dtype=torch.float32)
