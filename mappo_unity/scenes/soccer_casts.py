@@ -13,6 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
+_NUMBERS = 64  # colliders at most
+_NUMBER_BITS = np.array(_NUMBERS - 1, np.uint64)
+
 
 def unmet_discs(towards: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Return |p - o|^2 - reach^2 [D, n], inf where the caster overlaps the disc at the start.
@@ -94,11 +97,21 @@ class Walls:
         return travel
 
 
-def first_met(travel: np.ndarray) -> np.ndarray:
-    """Return which collider [R] each ray meets first, given travels [colliders, R]; contiguous.
+def numbered(colliders: int, rays: int) -> np.ndarray:
+    """Return the number of the collider in every place, uint64 [colliders, R], for `first_met`."""
+    assert colliders <= _NUMBERS
+    return np.repeat(np.arange(colliders, dtype=np.uint64)[:, None], rays, axis=1)
+
+
+def first_met(travel: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Return which collider [R] each ray meets first, given travels [colliders, R] and their `numbered`.
 
     The bits of floats >= 0, read as whole numbers, have the floats' order; those of inf, NaN and of
-    negative numbers, whose sign is the highest bit, are larger than all of them.
+    negative numbers, whose sign is the highest bit, are larger than all of them. The colliders' numbers
+    replace the lowest bits (2^-46 of a travel), so that the minimum tells which it was: several times as
+    fast as argmin across rows. Of travels as good as equal the lower number is the first.
     """
-    first: np.ndarray = travel.view(np.uint64).argmin(axis=0)
-    return first
+    bits = np.bitwise_and(travel.view(np.uint64), ~_NUMBER_BITS)
+    bits |= number
+    first: np.ndarray = np.minimum.reduce(bits, axis=0) & _NUMBER_BITS
+    return first.view(np.int64)

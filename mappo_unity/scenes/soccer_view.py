@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mappo_unity.scenes.rays import RaySensor
-from mappo_unity.scenes.soccer_casts import Walls, cast_discs, first_met, unmet_discs
+from mappo_unity.scenes.soccer_casts import Walls, cast_discs, first_met, numbered, unmet_discs
 from mappo_unity.scenes.soccer_physics import AGENT_RADIUS, BALL_RADIUS, SoccerPhysics
 from mappo_unity.scenes.soccer_pitch import (
     BACK_X,
@@ -97,7 +97,7 @@ class SoccerView:
         field, agent = np.divmod(np.concatenate(slots), len(self._yaw))
         heading = self._yaw[agent, field].take(layout.caster) + layout.angles
         travel = self._cast(agent, field, heading, layout.caster)
-        nearest = first_met(travel)
+        nearest = first_met(travel, layout.number)
         numbers = np.zeros(layout.size, np.float32)
         numbers[layout.first + self._columns.take(layout.columns + nearest)] = 1.0
         share = travel.take(nearest * len(heading) + layout.every) / RAY_LENGTH
@@ -165,7 +165,8 @@ class _Layout:
     """Where the numbers of all rays are, for some number of agents of each behavior.
 
     [R] each: `caster`, whose ray it is; `angles`, rad; `first` and `last` place of its numbers; `columns`,
-    where the row of its behavior begins in a table of `num_columns` columns; `every`, 0 to R - 1.
+    where the row of its behavior begins in a table of `num_columns` colliders; `every`, 0 to R - 1.
+    `number` [colliders, R]: the colliders' numbers.
     `blocks`: a behavior's begin, end, shape, and slices of its sensors.
     """
 
@@ -179,6 +180,7 @@ class _Layout:
         )
         self.columns = behavior * num_columns
         self.every = np.arange(len(behavior))
+        self.number = numbered(num_columns, len(behavior))
         self.size = int(numbers.sum())
         self.last = np.cumsum(numbers) - 1
         self.first = self.last - (numbers - 1)
