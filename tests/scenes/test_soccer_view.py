@@ -157,6 +157,20 @@ def test_strikers_see_the_goalie_and_the_purple_goal() -> None:
     assert seen(rays(env, 0)[0][0]) == (3, pytest.approx(3 - AGENT_REACH, abs=1e-5))
 
 
+@pytest.mark.parametrize("name", ["SoccerTwos", "StrikersVsGoalie"])
+def test_behaviors_seen_at_once_or_one_by_one_or_agent_by_agent(name: str) -> None:
+    env = make_scene(name, num_areas=5, seed=2)
+    assert isinstance(env, SoccerScene)
+    env.reset()
+    slots = [env.agents.members(behavior) for behavior in range(2)]
+    for behavior, at_once in enumerate(env.observe_all(slots)):
+        alone = env.observe(behavior, slots[behavior])
+        single = [env.observe(behavior, slot) for slot in slots[behavior][:, None]]
+        for sensor, frame in enumerate(at_once):
+            assert np.array_equal(frame, alone[sensor])
+            assert np.array_equal(frame, np.concatenate([each[sensor] for each in single]))
+
+
 def test_walls_agree_with_boxes_seen_from_their_front() -> None:
     rng = np.random.default_rng(0)
     centre, half = np.array([3.0, 1.0]), np.array([0.25, 4.0])
