@@ -27,6 +27,7 @@ from mlagents_envs.base_env import BaseEnv  # noqa: E402
 from mappo_unity import __version__  # noqa: E402
 from mappo_unity.link import encode, messages, side_channels  # noqa: E402
 from mappo_unity.link.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
+from mappo_unity.player_build import build, check_range  # noqa: E402
 
 EDITOR_PORT = 5004
 """Port on which a trainer waits for the Editor, used when no --mlagents-port is given."""
@@ -49,9 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_known_args(arguments)
     known, ignored = options
+    check_range("--mlagents-port", known.port, 1, 65535)
+    if known.num_areas is not None:
+        check_range("--num-areas", known.num_areas, 1)
+    params = dict(map(_parameter, known.param))
     if known.scene == "build":
-        from mappo_unity.player_build import build
-
         if len(ignored) < 2:
             raise ConfigError(
                 "mappo-player build needs a scene and a folder: mappo-player build 3DBall builds"
@@ -59,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         env_function(ignored[0])  # refuses a scene that does not exist
         print(build(ignored[0], ignored[1], ignored[2:], known))
         return 0
-    make_env = env_function(known.scene, known.num_areas, dict(map(_parameter, known.param)))
+    make_env = env_function(known.scene, known.num_areas, params)
     with _open_log(known.log_file) as file:
 
         def log(line: str) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from mappo_unity.cli import doctor_main
+from mappo_unity.config import ConfigError
 from mappo_unity.doctor import CURES, diagnose, port_state
 from mappo_unity.player import main as player_main
 
@@ -132,3 +133,12 @@ def test_mistakes_in_the_options(capsys: Any) -> None:
     assert "not allowed with" in capsys.readouterr().err
     assert doctor_main(["--help"]) == 0
     assert "--timeout-s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--port", "99999"), ("--timeout-s", "-1"), ("--timeout-s", "nan"), ("--seconds", "0")],
+)
+def test_options_out_of_range_are_named(option, value):
+    with pytest.raises(ConfigError, match=f"{option} {value} is out of range: it must be"):
+        diagnose(["--editor", option, value], print)

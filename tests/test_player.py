@@ -340,6 +340,13 @@ class TestCommand:
             (["Nowhere"], "there is no scene 'Nowhere'; choices: 3DBall"),
             (["3DBall", "--param", "mass=heavy"], "NAME=NUMBER"),
             (["3DBall", "--mlagents-port", "many"], "invalid int value: 'many'"),
+            (
+                ["3DBall", "--mlagents-port", "70000"],
+                "--mlagents-port 70000 is out of range: it must be from 1 to",
+            ),
+            (["3DBall", "--num-areas", "0"], "--num-areas 0 is out of range: it must be at least 1"),
+            (["build", "3DBall", "never", "--num-areas", "0"], "--num-areas 0 is out of range"),
+            (["build", "3DBall", "never", "--param", "mass=heavy"], "NAME=NUMBER"),
             (["build", "3DBall"], "needs a scene and a folder"),
             (["build", "Nowhere", "folder"], "there is no scene 'Nowhere'"),
             ([], "SCENE"),
