@@ -384,7 +384,9 @@ class Config:
     device: str = "cpu"
     """Device of the networks: cpu, cuda or cuda:N."""
     num_threads: int = 1
-    """Threads of torch; small networks want one."""
+    """Threads of torch while collecting; small networks want one."""
+    update_threads: int = 1
+    """Threads of torch while learning, at most one a core; large minibatches gain where a core is idle."""
     resume: Optional[str] = None
     """Run folder or checkpoint file to continue, in the same folder."""
     stop_at_return: Optional[float] = None
@@ -398,6 +400,7 @@ class Config:
         _at_least("checkpoint_interval", self.checkpoint_interval, 1)
         _at_least("keep_checkpoints", self.keep_checkpoints, 1)
         _at_least("num_threads", self.num_threads, 1)
+        _at_least("update_threads", self.update_threads, 1)
         _rule("stop_at_return", self.stop_at_return, True, "must be a finite number or null")
         kind, _, index = self.device.partition(":")
         if kind not in ("cpu", "cuda") or (index and not index.isdigit()):

@@ -7,6 +7,7 @@ collect, learn, count, log, save.
 from __future__ import annotations
 
 import math
+import os
 import signal
 import time
 from dataclasses import dataclass
@@ -189,12 +190,13 @@ class Trainer:
 
     def _learn(self, batch: TensorDictBase) -> dict[str, float]:
         progress = self.agent_steps / self.cfg.max_steps
-        return by_policy(
-            {
-                name: learner.learn(self.entries(batch, name), progress)
-                for name, learner in self.learners.items()
-            }
-        )
+        torch.set_num_threads(min(self.cfg.update_threads, os.cpu_count() or 1))
+        metrics = {
+            name: learner.learn(self.entries(batch, name), progress)
+            for name, learner in self.learners.items()
+        }
+        torch.set_num_threads(self.cfg.num_threads)
+        return by_policy(metrics)
 
     @staticmethod
     def entries(batch: TensorDictBase, name: str) -> TensorDictBase:
