@@ -438,6 +438,10 @@ class ExportConfig:
     out: Optional[str] = None
     """File (NAME.onnx) or folder to write; null: beside the checkpoint, under its name."""
 
+    def __post_init__(self) -> None:
+        if self.out == "":
+            raise ConfigError("out= is empty: it must name a file or a folder (null: beside the checkpoint)")
+
 
 @dataclass
 class PlayConfig:

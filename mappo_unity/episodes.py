@@ -16,6 +16,8 @@ from mappo_unity.policies import Policy
 from mappo_unity.rounds import Episode
 
 MAX_ENV_STEPS = 5_000_000
+NUM_BATCHES = 40  # of consecutive episodes, at most
+MIN_BATCH = 10  # episodes
 
 
 def play(
@@ -109,10 +111,23 @@ def summarize(episodes: list[Episode]) -> dict[str, Any]:
     out = {
         "episodes": len(episodes),
         "mean_return": float(returns.mean()),
-        "stderr": float(returns.std() / math.sqrt(len(returns))),
+        "stderr": standard_error(returns, any(e.group_id for e in episodes)),
         "mean_decisions": float(np.mean([e.length for e in episodes])),
         "interrupted": float(np.mean([e.interrupted for e in episodes])),
     }
     if group.any():
         out |= {"mean_individual_return": float(individual.mean()), "mean_group_return": float(group.mean())}
     return out
+
+
+def standard_error(values: np.ndarray, teams: bool = False) -> float:
+    """Return the standard error of the mean of episodes' returns, in the order of their ends.
+
+    Team mates earn the same and end together, so for teams it is taken from the means of consecutive
+    batches (batch means; Law and Kelton, Simulation Modeling and Analysis) as long as there are some.
+    """
+    if teams and len(values) >= 2 * MIN_BATCH:
+        batches = np.array_split(values, min(NUM_BATCHES, len(values) // MIN_BATCH))
+        values = np.array([batch.mean() for batch in batches])
+        return float(values.std(ddof=1) / math.sqrt(len(values)))
+    return float(values.std() / math.sqrt(len(values)))

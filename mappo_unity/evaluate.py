@@ -13,6 +13,7 @@ import torch
 from mappo_unity import checkpoint
 from mappo_unity.backend import make_env_function
 from mappo_unity.compose import config_to_play
+from mappo_unity.config import ConfigError
 from mappo_unity.episodes import play, summarize
 from mappo_unity.matches import Score, play_matches
 from mappo_unity.onnx_policy import SUFFIX, OnnxFolder, OnnxPolicy
@@ -52,7 +53,7 @@ def evaluate(
         else {}
     )
     if opponent is not None:
-        other = open_policy(opponent, deterministic, seed)
+        other = open_policy(opponent, deterministic, seed, "opponent")
         scores = play_matches(make_env, policy, other, episodes, seed)
         return head | {"opponent": opponent} | match_figures(scores)
     base_env = make_env(seed)
@@ -72,10 +73,18 @@ def match_figures(scores: dict[str, Score]) -> dict[str, Any]:
     return total.figures() | {"as": {side: score.figures() for side, score in scores.items()}}
 
 
-def open_policy(where: str, deterministic: bool, seed: int) -> Policy:
-    """Return "random", or the policy of a run folder, checkpoint, ONNX file or folder of ONNX files."""
+def open_policy(where: str, deterministic: bool, seed: int, option: str = "run") -> Policy:
+    """Return "random", or the policy of a run folder, checkpoint, ONNX file or folder of ONNX files.
+
+    Raises:
+        ConfigError: nothing is there (named by ``option``), or nothing that plays.
+    """
     if where == "random":
         return RandomPolicy(seed)
+    if not Path(where).exists():
+        raise ConfigError(
+            f"{option}={where} does not exist: give random, a run folder, a checkpoint or an ONNX file"
+        )
     if where.endswith(SUFFIX):
         return OnnxPolicy(Path(where), deterministic, seed)
     if list(Path(where).glob(f"*{SUFFIX}")) and not list(Path(where).glob("*.pt")):

@@ -91,10 +91,11 @@ def policies_of(cfg: PlayConfig, scene: Scene) -> dict[str, Policy]:
             name: OnnxPolicy(path, cfg.deterministic, cfg.seed) for name, path in paths.items()
         }
     else:
-        policies = dict.fromkeys(scene.behavior_specs, open_policy(where, cfg.deterministic, cfg.seed))
-    for name, policy in policies.items():
-        if isinstance(policy, (ActorPolicy, OnnxPolicy)):
-            policy.check(name, scene.behavior_specs[name])
+        policy = open_policy(where, cfg.deterministic, cfg.seed, "run" if cfg.run else "policy")
+        policies = dict.fromkeys(scene.behavior_specs, policy)
+    for name, plays in policies.items():
+        if isinstance(plays, (ActorPolicy, OnnxPolicy)):
+            plays.check(name, scene.behavior_specs[name])
     return policies
 
 

@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise ConfigError(
                 "mappo-player build needs a scene and a folder: mappo-player build 3DBall builds"
             )
-        env_function(ignored[0])  # refuses a scene that does not exist
+        env_function(ignored[0], known.num_areas, params)(0, None).close()  # it starts with these options
         print(build(ignored[0], ignored[1], ignored[2:], known))
         return 0
     make_env = env_function(known.scene, known.num_areas, params)

@@ -37,14 +37,13 @@ import torch
 from mappo_unity.backend import MakeEnv, make_env_function
 from mappo_unity.compose import config_to_play
 from mappo_unity.config import ConfigError
-from mappo_unity.episodes import play
+from mappo_unity.episodes import play, standard_error
 from mappo_unity.evaluate import choose_checkpoint
 from mappo_unity.export import export_checkpoint
 from mappo_unity.policies import CheckpointPolicy
 
 RUN_POLICY = Path(__file__).resolve().parents[2] / "shared" / "oracle" / "run_policy.py"
 PLAYS = ["sampled", "deterministic"]
-BATCHES = 40
 MAX_ENV_STEPS = 5_000_000
 ROUNDING = 1e-5  # of a mean: sums of float32 rewards in another order
 MAX_BIAS = 0.1  # standard errors
@@ -141,7 +140,7 @@ def compare(head: str, ours: Returns, theirs: Returns, agents: int) -> float:
         kinds["group"] = (ours.group, theirs.group)
     worst = 0.0
     for kind, (a, b) in kinds.items():
-        errors = batch_error(a), batch_error(b)
+        errors = standard_error(a, teams=True), standard_error(b, teams=True)
         unit = math.hypot(*errors, ROUNDING * max(1.0, abs(a.mean())))
         difference = (b.mean() - a.mean()) / unit
         bias = counting_bias(b, theirs.length, agents) / unit
@@ -153,15 +152,6 @@ def compare(head: str, ours: Returns, theirs: Returns, agents: int) -> float:
         )
         worst = max(worst, abs(difference))
     return worst
-
-
-def batch_error(values: np.ndarray) -> float:
-    """Return the standard error of the mean from the means of consecutive batches.
-
-    Episodes of one batch may depend on each other, as those of team-mates do.
-    """
-    means = np.array([part.mean() for part in np.array_split(values, min(BATCHES, len(values)))])
-    return float(means.std(ddof=1) / math.sqrt(len(means))) if len(means) > 1 else math.inf
 
 
 def counting_bias(values: np.ndarray, length: np.ndarray, agents: int) -> float:

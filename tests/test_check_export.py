@@ -25,13 +25,6 @@ def test_the_bias_is_that_of_leaving_out_the_last_episode(script):
     assert script.counting_bias(ended, ended, agents=5_000) == pytest.approx(-5 / 40, rel=0.1)
 
 
-def test_team_mates_are_not_counted_twice(script):
-    values = np.random.default_rng(1).normal(size=8_000)
-    alone, twice = script.batch_error(values), script.batch_error(np.repeat(values, 2))
-    assert twice == pytest.approx(alone, rel=1e-6)
-    assert alone == pytest.approx(1 / np.sqrt(8_000), rel=0.35)  # from 40 batches
-
-
 def test_a_missing_run_policy_is_named(script, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["check_export.py", "run", "--run-policy", "nowhere.py"])
     assert script.main() == 2

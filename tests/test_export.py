@@ -232,6 +232,7 @@ def test_mappo_export_writes_where_it_is_told(tiny_run, tmp_path, capsys):
     [
         ([], "run is not given"),
         (["run=nowhere"], "run=nowhere does not exist"),
+        (["run=nowhere", "out="], "out= is empty"),
         (["run=nowhere", "outt=x"], "outt"),
     ],
 )
@@ -262,6 +263,8 @@ def test_mappo_eval_plays_an_onnx_file_as_its_checkpoint(tiny_run, tmp_path, cap
     assert '"agent_steps": ' in capsys.readouterr().out
     assert eval_main([f"run={elsewhere}"]) == 2
     assert "env=NAME (3DBall" in capsys.readouterr().err
+    assert eval_main([f"run={best}.pt", "opponent=nowhere"]) == 2
+    assert "opponent=nowhere does not exist: give random, a run folder" in capsys.readouterr().err
 
 
 @pytest.mark.slow

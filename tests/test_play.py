@@ -212,7 +212,7 @@ def test_a_window_shows_frames_at_their_time() -> None:
         (["env=custom", "video=film.mp4"], "env.factory is not given"),
         (["env=Nope", "video=film.mp4"], "env=Nope does not exist"),
         (["run=nowhere", "video=film.mp4"], "run=nowhere does not exist"),
-        (["env=Basic", "policy=none.onnx", "video=film.gif"], "none.onnx does not exist"),
+        (["env=Basic", "policy=none.onnx", "video=film.gif"], "policy=none.onnx does not exist"),
         (["env=Basic"], "there is no display"),
     ],
 )

@@ -347,6 +347,7 @@ class TestCommand:
             (["3DBall", "--num-areas", "0"], "--num-areas 0 is out of range: it must be at least 1"),
             (["build", "3DBall", "never", "--num-areas", "0"], "--num-areas 0 is out of range"),
             (["build", "3DBall", "never", "--param", "mass=heavy"], "NAME=NUMBER"),
+            (["build", "3DBall", "never", "--param", "nosuch=3"], "nosuch"),
             (["build", "3DBall"], "needs a scene and a folder"),
             (["build", "Nowhere", "folder"], "there is no scene 'Nowhere'"),
             ([], "SCENE"),
