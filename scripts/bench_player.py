@@ -6,6 +6,7 @@ Where other work slows the wall clock down, read the CPU columns: trainer and pl
 with a core free for each needs the sum of both a round.
 
     python scripts/bench_player.py [--scene 3DBall] [--areas 12] [--repeats 5] [--train] [--seed 0]
+    python scripts/bench_player.py --scene SoccerTwos --train --max-steps 300000
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from mappo_unity.train import Trainer
 
 from mlagents_envs.base_env import BaseEnv  # isort: skip  # mappo_unity lets it import
 
+UNITY_AREAS = {"3DBall": 12, "SoccerTwos": 8, "StrikersVsGoalie": 8}  # where presets have more
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
@@ -47,6 +49,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=300, help="environment steps of one measurement")
     parser.add_argument("--train", action="store_true", help="train to --goal, too")
     parser.add_argument("--goal", type=float, default=95.0, help="mean return to train to")
+    parser.add_argument("--max-steps", type=int, default=None, help="agent steps to train at most")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -65,11 +68,12 @@ def main() -> None:
 
 def options(arguments: argparse.Namespace, build: str, *more: str) -> Config:
     """Return the scene's preset with its player below it."""
-    areas = [] if arguments.areas is None else [f"env.num_areas={arguments.areas}"]
-    if arguments.areas is None and arguments.scene == "3DBall":
-        areas = ["env.num_areas=12"]  # as in Unity
+    num_areas = arguments.areas or UNITY_AREAS.get(arguments.scene)
+    areas = [] if num_areas is None else [f"env.num_areas={num_areas}"]
     lines = [f"env={arguments.scene}", "env.backend=player", f"env.file_name={build}", *areas, *more]
-    quiet = ["log.backends=[]", "log.progress=false", "export_onnx=false", "collect.batch_size=4096"]
+    if arguments.max_steps is not None:
+        lines.append(f"max_steps={arguments.max_steps}")
+    quiet = ["log.backends=[]", "log.progress=false", "export_onnx=false", "matches.interval=null"]
     return compose_config([*lines, *quiet, f"seed={arguments.seed}"]).config
 
 
