@@ -20,6 +20,7 @@ from mappo_unity.link.messages import METHOD, OPTIONS, STATUS_QUIT, message
 
 ADDRESS = "127.0.0.1"
 POLL_S = 0.1  # how often the player's process is looked at while nothing comes
+GRACE_S = 1.0  # for the goodbye to reach the player: without it gRPC may cut the call that carries it
 
 
 class LinkTimeout(Exception):
@@ -88,7 +89,7 @@ class Link:
     def close(self) -> None:
         """Stop listening; the port is free again."""
         self.say_quit()
-        self._server.stop(0).wait(5)
+        self._server.stop(GRACE_S).wait(5)
         self._threads.shutdown()
 
     def _exchange(self, request: bytes, context: Any) -> bytes:
