@@ -6,7 +6,10 @@ what was done to it, what the metrics counted, how the training ended, and what 
 episodes of its own (those that troubles cut off do not count, and they are the long ones). Exit code 0 if it
 solved 3DBall and every trouble was counted.
 
-    python scripts/soak_player.py [--kills 20] [--hangs 5] [--malformed 5] [--nan 2] [--max-steps 2000000]
+While troubles come every second or two, the complete episodes are those that ended early, so the policy is
+judged after a second half without troubles.
+
+    python scripts/soak_player.py [--kills 20] [--hangs 5] [--malformed 5] [--nan 2] [--max-steps 4000000]
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ def main() -> int:
     parser.add_argument("--malformed", type=int, default=5)
     parser.add_argument("--nan", type=int, default=2)
     parser.add_argument("--every-s", type=float, default=1.5, help="mean time between two troubles")
-    parser.add_argument("--max-steps", type=int, default=2_000_000)
+    parser.add_argument("--max-steps", type=int, default=4_000_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("options", nargs="*", help="further options of mappo-train")
     arguments = parser.parse_args()
