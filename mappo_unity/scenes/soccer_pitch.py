@@ -31,9 +31,8 @@ BALL_HEIGHT = 0.5  # of the ball's centre above the goals' floors
 BLOCK_X, BLOCK_Z = 15.01, 3.957  # inner face and half-width of the block that closes a blue goal
 _ROUNDING = 1e-6  # m: a disc less deep than this has not hit anything
 NUM_FEATURES = 5
-_SIDE, _CORNER, _NET, _EDGE, _BACK = range(
-    NUM_FEATURES
-)  # features: long side, corner wall, net's side, its front, back
+# long side, corner wall, net's side, a mouth's edge, net's back or block
+_SIDE, _CORNER, _NET, _EDGE, _BACK = range(NUM_FEATURES)
 _NORMAL = np.array([[0.0, -_C, 0.0, 0.0, -1.0], [-1.0, -_S, -1.0, 0.0, 0.0]])
 # as arrays: NumPy takes those twice as fast as Python's numbers
 _ZERO, _ONE, _INF = np.array(0.0), np.array(1.0), np.array(np.inf)
