@@ -12,40 +12,43 @@ which balls seldom fall, is a row of its own.
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import numpy as np  # noqa: E402
-from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorSpec, DecisionSteps  # noqa: E402
+from mlagents_envs.base_env import ActionSpec, ActionTuple, BaseEnv, BehaviorSpec, DecisionSteps  # noqa: E402
 from omegaconf import OmegaConf  # noqa: E402
 
 from mappo_unity.presets import conf_dir  # noqa: E402
 from mappo_unity.scenes import make_scene, scene_names  # noqa: E402
 
+RING = 1009  # actions drawn for each number of agents
+STEPS_BETWEEN_CLOCKS = 16
 Policy = Callable[[BehaviorSpec, DecisionSteps], ActionTuple]
 
 
 def random_policy() -> Policy:
-    """Return a policy that cuts its actions from tables drawn beforehand."""
+    """Return a policy that takes its actions in turn from a ring drawn beforehand."""
     rng = np.random.default_rng(0)
-    tables: dict[tuple[int, tuple[int, ...]], tuple[np.ndarray, np.ndarray]] = {}
+    rings: dict[tuple[ActionSpec, int], Iterator[ActionTuple]] = {}
+
+    def draw(spec: ActionSpec, agents: int) -> ActionTuple:
+        branches = [rng.integers(0, size, agents) for size in spec.discrete_branches]
+        discrete = np.stack(branches, 1) if branches else np.zeros((agents, 0))
+        continuous = rng.uniform(-1, 1, (agents, spec.continuous_size))
+        return ActionTuple(continuous.astype(np.float32), discrete.astype(np.int32))
 
     def act(spec: BehaviorSpec, decisions: DecisionSteps) -> ActionTuple:
-        actions = spec.action_spec
-        key = (actions.continuous_size, actions.discrete_branches)
-        if key not in tables:
-            branches = [rng.integers(0, size, 65_536) for size in actions.discrete_branches]
-            discrete = np.stack(branches, 1) if branches else np.zeros((65_536, 0))
-            continuous = rng.uniform(-1, 1, (65_536, actions.continuous_size))
-            tables[key] = (continuous.astype(np.float32), discrete.astype(np.int32))
-        start = int(rng.integers(0, 65_536 - len(decisions)))
-        rows = slice(start, start + len(decisions))
-        return ActionTuple(tables[key][0][rows], tables[key][1][rows])
+        key = (spec.action_spec, len(decisions))
+        if key not in rings:
+            rings[key] = itertools.cycle([draw(*key) for _ in range(RING)])
+        return next(rings[key])
 
     return act
 
@@ -62,12 +65,13 @@ def decisions_per_s(env: BaseEnv, policy: Policy, seconds: float) -> float:
     """Step for `seconds` of processor time and return agent decisions a second."""
     count, start = 0, time.process_time()
     while (passed := time.process_time() - start) < seconds:
-        for name, spec in env.behavior_specs.items():
-            decisions, _ = env.get_steps(name)
-            if len(decisions):
-                env.set_actions(name, policy(spec, decisions))
-                count += len(decisions)
-        env.step()
+        for _ in range(STEPS_BETWEEN_CLOCKS):
+            for name, spec in env.behavior_specs.items():
+                decisions, _ = env.get_steps(name)
+                if agents := len(decisions):
+                    env.set_actions(name, policy(spec, decisions))
+                    count += agents
+            env.step()
     return count / passed
 
 

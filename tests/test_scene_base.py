@@ -246,7 +246,8 @@ def test_actions_follow_the_rows_after_ids_have_changed() -> None:
     assert ids(env, A)[0] == [1, 3, 4, 6]
     env.set_actions(A, ActionTuple(np.array([[0.1], [0.3], [0.4], [0.6]]), np.zeros((4, 2), np.int32)))
     env.step()
-    assert env.agents.continuous[[0, 1, 3, 4], 0].tolist() == pytest.approx([0.6, 0.1, 0.3, 0.4])
+    acted = dict(zip(env.acted[-1][1], env.acted[-1][2], strict=True))
+    assert [acted[slot] for slot in (0, 1, 3, 4)] == pytest.approx([0.6, 0.1, 0.3, 0.4])
 
 
 def test_agent_moves_to_another_behavior() -> None:
@@ -309,11 +310,11 @@ def test_unset_actions_are_zero_and_one_agent_can_be_set() -> None:
     env = started()
     env.set_actions(A, ActionTuple(np.ones((4, 1)), np.ones((4, 2), np.int32)))
     env.step()
-    assert env.agents.continuous[:, 0].tolist() == [1, 1, 0, 1, 1, 0]
+    assert env.acted[-1][1:] == ([0, 1, 2, 3, 4, 5], [1, 1, 0, 1, 1, 0])
     env.set_action_for_agent(A, 3, ActionTuple(np.full((1, 1), 0.5), np.array([[2, 1]], np.int32)))
-    env.step()
-    assert env.agents.continuous[:, 0].tolist() == [0, 0, 0, 0.5, 0, 0]
     assert env.agents.discrete[3].tolist() == [2, 1]
+    env.step()
+    assert env.acted[-1][2] == [0, 0, 0, 0.5, 0, 0]
 
 
 def test_wrong_actions_names_and_order_of_calls_are_refused() -> None:
@@ -327,8 +328,9 @@ def test_wrong_actions_names_and_order_of_calls_are_refused() -> None:
         env.set_actions(A, ActionTuple(np.zeros((3, 1)), np.zeros((3, 2), np.int32)))
     with pytest.raises(UnityActionException, match=r"agent 3 of A\?team=0 is invalid"):
         env.set_actions(A, ActionTuple(np.array([[0], [0], [np.nan], [0]]), np.zeros((4, 2), np.int32)))
-    with pytest.raises(UnityActionException, match=r"agent 2 of B\?team=1 .* branches \[4\]"):
-        env.set_actions(B, ActionTuple(discrete=np.array([[4], [0]])))
+    for index in (4, -1):
+        with pytest.raises(UnityActionException, match=r"agent 2 of B\?team=1 .* branches \[4\]"):
+            env.set_actions(B, ActionTuple(discrete=np.array([[index], [0]])))
     env.close()
     with pytest.raises(UnityEnvironmentException, match="closed"):
         env.step()
@@ -340,7 +342,7 @@ def test_actions_are_copied_when_set() -> None:
     env.set_actions(A, ActionTuple(continuous, np.zeros((4, 2), np.int32)))
     continuous[:] = 0.25
     env.step()
-    assert env.agents.continuous[0, 0] == 1.0
+    assert env.acted[-1][2][0] == 1.0
 
 
 def test_snapshot_repeats_to_the_bit_with_new_ids_stacks_and_pending_actions() -> None:

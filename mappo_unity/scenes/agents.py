@@ -34,7 +34,14 @@ class Agents:
     `continuous` float32 [S, C], `discrete` int32 [S, K]: the stored action, zeros after an end.
     """
 
-    def __init__(self, behavior: np.ndarray, group_id: np.ndarray, num_continuous: int, num_branches: int):
+    def __init__(
+        self,
+        behavior: np.ndarray,
+        group_id: np.ndarray,
+        num_behaviors: int,
+        num_continuous: int,
+        num_branches: int,
+    ) -> None:
         num_slots = len(behavior)
         self.enabled = np.ones(num_slots, bool)
         self.agent_id = np.arange(num_slots, dtype=np.int32)
@@ -47,22 +54,44 @@ class Agents:
         self.continuous = np.zeros((num_slots, num_continuous), np.float32)
         self.discrete = np.zeros((num_slots, num_branches), np.int32)
         self.next_id = num_slots
+        self._num_behaviors = num_behaviors
+        self._one_tick = np.ones(num_slots, np.int64)  # numpy adds arrays of one shape fastest
         self._order: np.ndarray | None = None
-        self._members: dict[int, np.ndarray] = {}
+        self._is_slot_order = False
+        self._members: list[np.ndarray] | None = None
 
     @property
     def order(self) -> np.ndarray:
         """Return the slots of enabled agents by ascending agent id, the order of rows in Python."""
         if self._order is None:
-            slots = np.flatnonzero(self.enabled)
-            self._order = slots[np.argsort(self.agent_id[slots], kind="stable")]
+            slots = self.enabled.nonzero()[0]
+            self._order = slots[self.agent_id[slots].argsort(kind="stable")]
+            everyone = len(slots) == len(self.enabled)
+            self._is_slot_order = everyone and not np.count_nonzero(self._order - slots)
         return self._order
 
-    def members(self, behavior: int) -> np.ndarray:
-        """Return the slots of a behavior's enabled agents by ascending agent id."""
-        if behavior not in self._members:
-            self._members[behavior] = self.order[self.behavior[self.order] == behavior]
-        return self._members[behavior]
+    @property
+    def members(self) -> list[np.ndarray]:
+        """Return the slots of each behavior's enabled agents by ascending agent id."""
+        if self._members is None:
+            behavior = self.behavior[self.order]
+            several = self._num_behaviors > 1
+            self._members = (
+                [self.order[behavior == i] for i in range(self._num_behaviors)] if several else [self.order]
+            )
+        return self._members
+
+    def count_tick(self) -> None:
+        """Count one tick of every agent's episode."""
+        self.step_count = self.step_count + self._one_tick
+
+    def store_actions(self, slots: np.ndarray, continuous: np.ndarray, discrete: np.ndarray) -> None:
+        """Store the actions of `slots`, one row each; columns that their behavior lacks stay."""
+        rows = slice(None) if slots is self._order and self._is_slot_order else slots
+        if continuous.shape[1]:
+            self.continuous[rows, : continuous.shape[1]] = continuous
+        if discrete.shape[1]:
+            self.discrete[rows, : discrete.shape[1]] = discrete
 
     def finish(self, slots: np.ndarray) -> None:
         """Clear rewards and actions after a terminal record, and remember that the agent has ended."""
@@ -73,8 +102,12 @@ class Agents:
 
     def clear_actions(self, slots: np.ndarray) -> None:
         """Forget the stored actions: zeros are executed until the next decision."""
-        self.continuous[slots] = 0
-        self.discrete[slots] = 0
+        if len(slots) == len(self.enabled):
+            self.continuous.fill(0)
+            self.discrete.fill(0)
+        else:
+            self.continuous[slots] = 0
+            self.discrete[slots] = 0
 
     def disable(self, slots: np.ndarray) -> None:
         """Take agents out of the scene and out of their groups."""
@@ -111,4 +144,4 @@ class Agents:
 
     def _forget_order(self) -> None:
         self._order = None
-        self._members = {}
+        self._members = None

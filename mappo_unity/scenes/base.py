@@ -36,13 +36,13 @@ from mlagents_envs.base_env import (
     ActionTuple,
     BaseEnv,
     BehaviorMapping,
-    BehaviorSpec,
     DecisionSteps,
     TerminalSteps,
 )
 from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
 
 from mappo_unity.config import ConfigError
+from mappo_unity.scenes.action_check import ActionCheck
 from mappo_unity.scenes.agents import Agents
 from mappo_unity.scenes.records import TerminalQueue, steps_from_state, steps_state
 from mappo_unity.scenes.specs import Behavior, Parameter, checked_parameter
@@ -87,20 +87,23 @@ class Scene(BaseEnv):
         for name, value in parameters.items():
             self.parameters[name] = checked_parameter(self.NAME, self.PARAMETERS, name, value)
         self._specs = [behavior.spec() for behavior in self.BEHAVIORS]
-        self._branch_sizes = [np.array(behavior.branches, np.int32) for behavior in self.BEHAVIORS]
+        names = [behavior.name for behavior in self.BEHAVIORS]
+        self._behavior_specs = BehaviorMapping(dict(zip(names, self._specs, strict=True)))
+        self._checks = [ActionCheck(behavior) for behavior in self.BEHAVIORS]
         self._index = {behavior.name: i for i, behavior in enumerate(self.BEHAVIORS)}
         self.agents = Agents(
             np.tile(np.array(self.AREA_BEHAVIORS), self.num_areas),
             self.home_groups(),
+            len(self.BEHAVIORS),
             max(behavior.continuous for behavior in self.BEHAVIORS),
             max(len(behavior.branches) for behavior in self.BEHAVIORS),
         )
         sensors = [sensor for behavior in self.BEHAVIORS for sensor in behavior.sensors]
         self._stacks = Stacks(sensors, self.num_slots)
+        self._is_stacked = [any(sensor.stack > 1 for sensor in b.sensors) for b in self.BEHAVIORS]
         self._queue = TerminalQueue(self._specs)
         self._empty = [DecisionSteps.empty(spec) for spec in self._specs]
         self._results: list[tuple[DecisionSteps, TerminalSteps]] = []
-        self._actions: dict[int, ActionTuple] = {}
         self._asked = np.zeros(0, np.int64)
         self._asked_rows: list[np.ndarray] = [self._asked for _ in self.BEHAVIORS]
         self.counter = 0  # the academy's step count: ticks since the start or the last env.reset()
@@ -119,6 +122,8 @@ class Scene(BaseEnv):
 
     def observe_all(self, slots: list[np.ndarray]) -> list[list[np.ndarray]]:
         """Return what `observe` does for `slots` of every behavior; override to save work in common."""
+        if len(slots) == 1:
+            return [self.observe(0, slots[0])]
         return [self.observe(behavior, rows) if rows.size else [] for behavior, rows in enumerate(slots)]
 
     def act(self, slots: np.ndarray) -> None:
@@ -227,7 +232,7 @@ class Scene(BaseEnv):
     @property
     def behavior_specs(self) -> BehaviorMapping:
         """Return the specs of all behaviors, complete from the start."""
-        return BehaviorMapping({b.name: spec for b, spec in zip(self.BEHAVIORS, self._specs, strict=True)})
+        return self._behavior_specs
 
     def reset(self) -> None:
         """Reset as Unity's academy does: the first time tick 0, later at the exchange of a running tick.
@@ -237,7 +242,6 @@ class Scene(BaseEnv):
         """
         self._check_open()
         if self.started:
-            self._actions.clear()
             self.counter = 0
             self.agents.step_count[:] = 0
             slots = self.agents.order
@@ -251,7 +255,6 @@ class Scene(BaseEnv):
         self._check_open()
         if not self.started:
             return self.reset()
-        self._store_actions()
         self._finish_tick()
         self._run_to_exchange()
 
@@ -269,20 +272,19 @@ class Scene(BaseEnv):
     def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
         """Set the actions of all agents in the last decision steps, in their order."""
         behavior = self._behavior(behavior_name)
-        count = len(self._asked_rows[behavior])
-        self._actions[behavior] = self._checked_action(behavior, action, self._asked_rows[behavior], count)
+        slots = self._asked_rows[behavior]
+        self._checks[behavior](action, self.agents.agent_id[slots])
+        self.agents.store_actions(slots, action.continuous, action.discrete)
 
     def set_action_for_agent(self, behavior_name: str, agent_id: int, action: ActionTuple) -> None:
         """Set the action of one agent in the last decision steps; those never set act with zeros."""
         behavior = self._behavior(behavior_name)
         slots = self._asked_rows[behavior]
-        row = np.flatnonzero(self.agents.agent_id[slots] == agent_id)
-        if not row.size:
+        slot = slots[self.agents.agent_id[slots] == agent_id]
+        if not slot.size:
             raise IndexError(f"agent {agent_id} of {behavior_name} did not request a decision")
-        action = self._checked_action(behavior, action, slots[row], 1)
-        spec = self._specs[behavior].action_spec
-        stored = self._actions.setdefault(behavior, spec.empty_action(len(slots)))
-        stored.continuous[row], stored.discrete[row] = action.continuous, action.discrete
+        self._checks[behavior](action, self.agents.agent_id[slot])
+        self.agents.store_actions(slot, action.continuous, action.discrete)
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set an environment parameter; the scene's sheet says when it takes effect."""
@@ -303,10 +305,6 @@ class Scene(BaseEnv):
             "stacks": self._stacks.get_state(),
             "asked": self._asked.copy(),
             "results": [[steps_state(d), steps_state(t)] for d, t in self._results],
-            "actions": {
-                self.BEHAVIORS[i].name: [action.continuous.copy(), action.discrete.copy()]
-                for i, action in self._actions.items()
-            },
             "state": self.scene_state(),
         }
 
@@ -326,10 +324,6 @@ class Scene(BaseEnv):
         self._queue.clear()
         self._results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]
         self._set_asked(state["asked"].copy())
-        self._actions = {
-            self._index[name]: ActionTuple(parts[0].copy(), parts[1].copy())
-            for name, parts in state["actions"].items()
-        }
         self.load_scene_state(state["state"])
 
     # ---- the tick ---------------------------------------------------------------------------------------
@@ -345,16 +339,17 @@ class Scene(BaseEnv):
         if not self.started:
             self.begin_episode(agents.order)
         decides = self.decides()
-        if decides is False:
-            self._set_asked(agents.order[:0])
+        if decides is True:
+            self._set_asked(agents.order)
         else:
-            self._set_asked(agents.order if decides is True else agents.order[decides[agents.order]])
+            self._set_asked(agents.order[:0] if decides is False else agents.order[decides[agents.order]])
         self.counter += 1
-        agents.step_count += 1
+        agents.count_tick()
         if not self._asked.size and not len(self._queue) and self.started:
             return False
         frames = self.observe_all(self._asked_rows) if self._asked.size else [[] for _ in self.BEHAVIORS]
-        self._results = [self._result(behavior, own) for behavior, own in enumerate(frames)]
+        self._results = list(map(self._result, range(len(frames)), frames))
+        agents.clear_actions(self._asked)
         return True
 
     def _finish_tick(self) -> None:
@@ -364,7 +359,7 @@ class Scene(BaseEnv):
             self.act(slots)
         if self.MAX_STEP:
             late = self.agents.step_count >= self.MAX_STEP
-            if late.any():
+            if np.count_nonzero(late):
                 self.end_episode(late, interrupted=True)
         self.controllers()
         self.simulate()
@@ -392,11 +387,11 @@ class Scene(BaseEnv):
 
     def _observations(self, behavior: int, slots: np.ndarray, frames: list[np.ndarray]) -> list[np.ndarray]:
         """Put new frames on the stacks and return what the sensors show."""
+        if not self._is_stacked[behavior]:
+            return frames
         sensors = self.BEHAVIORS[behavior].sensors
-        assert [frame.shape[1:] for frame in frames] == [sensor.shape for sensor in sensors], behavior
-        return [
-            self._stacks.push(sensor, slots, frame) for sensor, frame in zip(sensors, frames, strict=True)
-        ]
+        push = self._stacks.push
+        return [push(sensor, slots, frame) for sensor, frame in zip(sensors, frames, strict=True)]
 
     def _send_terminals(self, slots: np.ndarray, interrupted: bool) -> None:
         agents = self.agents
@@ -418,19 +413,10 @@ class Scene(BaseEnv):
         self._stacks.clear(slots)
         agents.finish(slots)
 
-    def _store_actions(self) -> None:
-        agents = self.agents
-        agents.clear_actions(self._asked)
-        for behavior, action in self._actions.items():
-            slots = self._asked_rows[behavior]
-            agents.continuous[slots, : action.continuous.shape[1]] = action.continuous
-            agents.discrete[slots, : action.discrete.shape[1]] = action.discrete
-        self._actions.clear()
-
     def _set_asked(self, slots: np.ndarray) -> None:
         self._asked = slots
         if slots is self.agents.order:
-            self._asked_rows = [self.agents.members(i) for i in range(len(self.BEHAVIORS))]
+            self._asked_rows = self.agents.members
         elif not slots.size:
             self._asked_rows = [slots] * len(self.BEHAVIORS)
         else:
@@ -443,30 +429,13 @@ class Scene(BaseEnv):
         return slots[self.agents.enabled[slots]]
 
     def _behavior(self, name: str) -> int:
-        if name not in self._index:
+        try:
+            return self._index[name]
+        except KeyError:
+            known = list(self._index)
             raise UnityActionException(
-                f"scene {self.NAME} has no behavior {name!r}; it has {list(self._index)}"
-            )
-        return self._index[name]
-
-    def _checked_action(
-        self, behavior: int, action: ActionTuple, slots: np.ndarray, count: int
-    ) -> ActionTuple:
-        """Return a copy of `action` after checks of shape, finiteness and branch sizes."""
-        declared = self.BEHAVIORS[behavior]
-        spec: BehaviorSpec = self._specs[behavior]
-        spec.action_spec._validate_action(action, count, declared.name)
-        continuous, discrete = action.continuous, action.discrete
-        bad = ~np.isfinite(continuous)
-        outside = (discrete < 0) | (discrete >= self._branch_sizes[behavior])
-        if np.count_nonzero(bad) or np.count_nonzero(outside):
-            row = int(np.flatnonzero(bad.any(axis=1) | outside.any(axis=1))[0])
-            raise UnityActionException(
-                f"action of agent {int(self.agents.agent_id[slots[row]])} of {declared.name} is invalid: "
-                f"continuous {continuous[row].tolist()} must be finite, discrete {discrete[row].tolist()} "
-                f"within branches {list(declared.branches)}"
-            )
-        return ActionTuple(continuous.copy(), discrete.copy())
+                f"scene {self.NAME} has no behavior {name!r}; it has {known}"
+            ) from None
 
     def _check_open(self) -> None:
         if self._closed:

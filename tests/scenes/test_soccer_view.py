@@ -162,7 +162,7 @@ def test_behaviors_seen_at_once_or_one_by_one_or_agent_by_agent(name: str) -> No
     env = make_scene(name, num_areas=5, seed=2)
     assert isinstance(env, SoccerScene)
     env.reset()
-    slots = [env.agents.members(behavior) for behavior in range(2)]
+    slots = env.agents.members
     for behavior, at_once in enumerate(env.observe_all(slots)):
         alone = env.observe(behavior, slots[behavior])
         single = [env.observe(behavior, slot) for slot in slots[behavior][:, None]]
