@@ -115,7 +115,9 @@ class DungeonEscape(Scene):
         self.has_key |= taken
         self.room.present[:, KEY] &= ~taken.any(axis=1)
         self._kill(_first(touching[:, :, DRAGON]))
-        self._unlock(np.any(entered & self.has_key, axis=1))
+        unlocked = entered & self.has_key
+        self.has_key &= ~unlocked  # the key is used up before the episode's last record
+        self._unlock(unlocked.any(axis=1))
         self._enter_portal(touching[:, :, PORTAL])
         escaped &= self.room.present[:, DRAGON] & (self.timer > 0)
         self._end_groups(np.flatnonzero(escaped))

@@ -27,6 +27,7 @@ PORTAL_TARGET = np.array([11.58, -11.59])
 DRAGON_START = np.array([[0.0, 8.0], [-8.0, 0.0], [0.0, -8.0], [8.0, 0.0]])
 """x, z by the platform's quarter turns, [4, 2]: the place is fixed in the world."""
 DRAGON_START_Y = 0.79
+DRAGON_START_YAW = np.pi - np.pi / 2 * np.arange(4)  # along -z of the world, seen from the turned platform
 
 AGENT_HALF = (0.5, 0.5, 0.5)
 KEY_HALF = (0.605, 0.23, 0.09)

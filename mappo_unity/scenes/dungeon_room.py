@@ -19,6 +19,7 @@ from mappo_unity.scenes.dungeon_layout import (
     DRAGON,
     DRAGON_START,
     DRAGON_START_Y,
+    DRAGON_START_YAW,
     HALVES,
     KEY,
     KEY_OFFSET,
@@ -52,7 +53,7 @@ _STATE = (
     "present",
     "dragon_fall",
     "dragon_speed",
-    "_dragon_step",
+    "_dragon_way",
 )
 
 
@@ -80,7 +81,7 @@ class DungeonRoom:
         self.present[:, [LOCK, PORTAL]] = True
         self.dragon_fall = np.zeros(num_areas)
         self.dragon_speed = np.zeros(num_areas)
-        self._dragon_step = np.zeros((num_areas, 2))  # m in a tick, x and z
+        self._dragon_way = np.zeros((num_areas, 2))  # unit vector along x and z
         self._drive = np.zeros((num_slots, 3))  # m/s, asked for in this tick
         self._extent = np.zeros(num_slots)  # m: half the agents' width along the room's axes, in this tick
         self._contacts = Contacts(num_areas)
@@ -114,16 +115,15 @@ class DungeonRoom:
         self.present[areas, DRAGON] = True
         self.thing[areas, DRAGON, 1] = DRAGON_START_Y
         self.thing[areas, DRAGON, ::2] = DRAGON_START[turn]
+        self.thing_yaw[areas, DRAGON] = DRAGON_START_YAW[turn]  # until its first move
         self.dragon_fall[areas] = 0.0
         self.dragon_speed[areas] = rng.uniform(*speed, len(areas))
-        self.face_portal(areas)
+        self.aim_at_portal(areas)
 
-    def face_portal(self, areas: np.ndarray) -> None:
-        """Turn the dragons of `areas` [n] to the portal; on a straight way they keep that heading."""
+    def aim_at_portal(self, areas: np.ndarray) -> None:
+        """Let the dragons of `areas` [n] turn to the portal at their next move, and keep that way."""
         ahead = PORTAL_TARGET - self.thing[areas, DRAGON, ::2]
-        self.thing_yaw[areas, DRAGON] = np.arctan2(ahead[:, 0], ahead[:, 1])
-        step = self.dragon_speed[areas] * TICK_S / np.hypot(ahead[:, 0], ahead[:, 1])
-        self._dragon_step[areas] = step[:, None] * ahead
+        self._dragon_way[areas] = ahead / np.hypot(ahead[:, 0], ahead[:, 1])[:, None]
 
     def refresh(self, enabled: np.ndarray) -> None:
         """Note who is there to be touched, whenever something has appeared or vanished; bool [N, A]."""
@@ -213,7 +213,8 @@ class DungeonRoom:
     def _move_dragons(self) -> None:
         """Step towards the portal by position; slide along a column's base; fall onto the floor."""
         position = self.thing[:, DRAGON]
-        position[:, ::2] += self._dragon_step
+        self.thing_yaw[:, DRAGON] = np.arctan2(self._dragon_way[:, 0], self._dragon_way[:, 1])
+        position[:, ::2] += self._dragon_way * (self.dragon_speed * TICK_S)[:, None]
         height = position[:, 1] - DRAGON_STANDING
         if height.any():
             self.dragon_fall -= self.gravity * TICK_S
@@ -228,4 +229,4 @@ class DungeonRoom:
             offset[:, ::2] -= np.copysign(COLUMN, offset[:, ::2])
             gap, normal = box_gap(offset, self.thing_yaw[near, DRAGON], HALVES[DRAGON], HALVES[COLUMN_BASE])
             position[near] += push_out(gap)[:, None] * normal
-            self.face_portal(near[gap < 0])
+            self.aim_at_portal(near[gap < 0])

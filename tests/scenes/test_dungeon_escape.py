@@ -47,7 +47,7 @@ def place_dragon(env: DungeonEscape, x: float, z: float, speed: float = 0.0) -> 
     env.room.thing[0, DRAGON] = (x, 0.75, z)
     env.room.dragon_fall[:] = 0
     env.room.dragon_speed[:] = speed
-    env.room.face_portal(np.array([0]))
+    env.room.aim_at_portal(np.array([0]))
 
 
 def play(env: DungeonEscape, actions: list[int] | int = NONE) -> tuple[DecisionSteps, TerminalSteps]:
@@ -217,6 +217,7 @@ def test_key_and_door_free_the_area() -> None:
     assert terminals.agent_id.tolist() == [1, 2]
     assert terminals.group_reward.tolist() == [1.0, 1.0] and not terminals.reward.any()
     assert not terminals.interrupted.any() and terminals.group_id.tolist() == [1, 1]
+    assert not terminals.obs[2].any()  # the key is used up
     while not len(decisions):
         decisions, _ = play(env)
     assert decisions.agent_id.tolist() == [1, 2, 3]  # the dead one is back under a new id
@@ -337,7 +338,7 @@ def test_spawns_keep_clear_of_columns_and_each_other() -> None:
     assert (np.hypot(beside[..., 0], beside[..., 1]) > 0.718).all()
     for one, other in ((1, 0), (2, 0), (2, 1)):
         apart = np.abs(place[:, one, ::2] - place[:, other, ::2]).max(axis=1)
-        assert apart.min() >= 2.5 + 0.5
+        assert apart.min() >= 2.5 + np.sqrt(0.125)  # a body turned by 45 degrees, beside the box's corner
     assert 0.05 < (np.abs(place[..., 0]) > 2).mean() and 0.05 < (np.abs(place[..., 2]) > 2).mean()
     yaw = env.room.yaw
     assert yaw.min() >= 0 and yaw.max() <= 2 * np.pi and yaw.std() > 1.6
@@ -345,10 +346,16 @@ def test_spawns_keep_clear_of_columns_and_each_other() -> None:
 
 def test_dragon_starts_in_world_axes_with_a_new_speed() -> None:
     env = dungeon(400, seed=1)
-    starts = {(round(x), round(z)) for x, z in dungeon(400, seed=1).room.thing[:, DRAGON, ::2].tolist()}
     env.room.reset(np.arange(400), env.rng, env.enabled, (1.0, 7.0))
     starts = {(x, z) for x, z in env.room.thing[:, DRAGON, ::2].tolist()}
     assert starts == {(0.0, 8.0), (-8.0, 0.0), (0.0, -8.0), (8.0, 0.0)}
+    yaw = np.degrees(env.room.thing_yaw[:, DRAGON])
+    ahead = {(x, z): turn for (x, _, z), turn in zip(env.room.thing[:, DRAGON].tolist(), yaw, strict=True)}
+    assert ahead == {(0.0, 8.0): 180.0, (-8.0, 0.0): 90.0, (0.0, -8.0): 0.0, (8.0, 0.0): -90.0}
+    place = env.room.thing[:, DRAGON].copy()
+    env.room.step()
+    way = env.room.thing[:, DRAGON] - place
+    assert np.allclose(env.room.thing_yaw[:, DRAGON], np.arctan2(way[:, 0], way[:, 2]))  # it faces the portal
     speed = env.room.dragon_speed
     assert 1.0 <= speed.min() < 1.2 and 6.8 < speed.max() <= 7.0
 
