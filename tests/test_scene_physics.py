@@ -49,6 +49,9 @@ def test_arrays_inputs_and_free_fall(per_model: int) -> None:
     assert physics.qvel[:, 6] == pytest.approx(np.arange(7) / 4 * 0.04)  # F / m * t
     assert physics.qvel[2, 0] == pytest.approx(6 / 2 * 0.04) and physics.qvel[1, 0] == 0
     assert physics.sensordata[0, 1] == pytest.approx(3 - 0.01 * (0.1 + 0.2 + 0.3))  # before the last substep
+    heights = physics.substep_sensors()[:, :, 1]
+    assert heights.shape == (7, 4)
+    assert heights[0].tolist() == pytest.approx([3, 3 - 0.01 * 0.1, 3 - 0.01 * 0.3, 3 - 0.01 * 0.6])
 
 
 @pytest.mark.parametrize("per_model", [1, 3])

@@ -90,9 +90,20 @@ class AreaPhysics:
         self._qvel[rows] = last[:, 1 + self._nq : 1 + self._nq + self._nv].reshape(per_area)
         if sensors.shape[2]:
             self._sensordata[rows] = sensors[:, -1].reshape(per_area)
+            self._last_sensors = sensors
         if not np.isfinite(self._qvel[rows].sum()):
             area = int(np.flatnonzero(~np.isfinite(self._qvel).all(axis=1))[0])
             raise FloatingPointError(f"physics of area {area} is not finite any more")
+
+    def substep_sensors(self) -> np.ndarray:
+        """Return the sensors in every substep of the last `step`, float64 [areas, substeps, nsensordata].
+
+        Each as MuJoCo has it, of the poses before the substep's motion: what came and went shows here.
+        """
+        models, substeps, _ = self._last_sensors.shape
+        by_area = self._last_sensors.reshape(models, substeps, self._per_model, -1)
+        areas = by_area.swapaxes(1, 2).reshape(models * self._per_model, substeps, -1)
+        return areas[: self._num_areas]
 
     def own_model(self, area: int) -> tuple[mujoco.MjModel, str]:
         """Return the model of an area, not shared with other models, and the prefix of the area's names.
@@ -156,6 +167,7 @@ class AreaPhysics:
                 self._control_spec |= int(bit)
                 self._inputs.append((slice(start, start + size), self._input_arrays[name]))
                 start += size
+        self._last_sensors = np.zeros((len(self._models), 1, self._shared.nsensordata))
         self._by_substeps: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def _buffers(self, num_substeps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -125,9 +125,9 @@ class PyramidsBodies:
         return touching
 
     def move(self, moved: np.ndarray) -> None:
-        """Advance positions by one tick; agents of areas `moved` bool [N] have been by the bricks' engine."""
+        """Advance positions by one tick; the bricks' engine has moved those of `moved` bool [N] along x, z."""
         step = self.velocity * TICK_S
-        step[moved] = 0.0
+        step[moved, ::2] = 0.0
         self.position += step
         self.position += self._shift
         self.switch_position[:, 1] += self.switch_fall * TICK_S

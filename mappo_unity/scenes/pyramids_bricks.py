@@ -18,7 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mappo_unity.scenes.ground import TICK_S
+from mappo_unity.scenes.ground import CONTACT_GAP, TICK_S
 from mappo_unity.scenes.physics import AreaPhysics
 from mappo_unity.scenes.pyramids_layout import (
     BRICKS,
@@ -137,7 +137,8 @@ class PyramidsBricks:
         physics.step(SUBSTEPS, areas)
         position[areas, 0], position[areas, 2] = physics.qpos[areas, 0], physics.qpos[areas, 1]
         velocity[areas, 0], velocity[areas, 2] = physics.qvel[areas, 0], physics.qvel[areas, 1]
-        goal[areas] = physics.sensordata[areas, 0] > 0
+        distance = physics.substep_sensors()[:, :, 0].min(axis=1)  # the goal may be thrown clear in the tick
+        goal[areas] = distance < CONTACT_GAP
         self._rest(areas)
         return goal
 
@@ -260,7 +261,7 @@ def _area_spec() -> mujoco.MjSpec:
     </body>
     {cubes}
   </worldbody>
-  <sensor><contact geom1="agent" geom2="goal" num="1" data="found"/></sensor>
+  <sensor><distance geom1="agent" geom2="goal" cutoff="1"/></sensor>
 </mujoco>
 """)
 

@@ -84,5 +84,5 @@ def _stone_layers() -> np.ndarray:
 STONE_LAYERS = _stone_layers()
 """One box a layer of a stone pyramid, [4, 7]: centre from the root as spawned, half sizes, height at rest.
 
-The gaps between a layer's cubes (0.3 m at most) are closed: nothing that has a body fits into them.
+The gaps between a layer's cubes (0.35 m at most) are closed: nothing that has a body fits into them.
 """

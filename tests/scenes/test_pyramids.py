@@ -285,6 +285,35 @@ def test_the_goal_ends_the_episode_and_replaces_the_reward() -> None:
     assert env.bricks.mode.tolist() == [ABSENT] and not env.switch_on.any()
 
 
+@pytest.mark.parametrize("gap", [0.05, 0.3, 0.55])
+def test_a_goal_that_is_thrown_clear_within_the_tick_has_been_touched(gap: float) -> None:
+    env = pyramids()
+    place(env, 0.0, -10.0, 0.0)
+    env.switch_on[0] = True
+    env.bricks.appear(AREA, np.zeros((1, 2)))
+    play(env, NONE, 40)
+    env.bricks.bodies[0, -1] = (0.0, 1.0, -10.0 + 1.5 + gap, 1, 0, 0, 0)
+    env.bodies.velocity[0, 2] = 35.0  # 0.66 m in the tick after drag: the goal is hit and flies ahead
+    env.simulate()
+    assert env.bricks.mode.tolist() == [ABSENT] and not env.switch_on.any()
+    assert env.agents.done.tolist() == [True]
+
+
+def test_an_agent_falls_on_beside_an_awake_pile() -> None:
+    env = pyramids()
+    place(env, 0.0, -6.0, 0.0)
+    env.bodies.position[0, 1] = 2.0
+    env.bricks.appear(AREA, np.array([[18.1, 18.1]]))
+    heights = []
+    for _ in range(35):
+        env.simulate()
+        heights.append(env.bodies.position[0, 1])
+    assert env.bricks.mode.tolist() == [AWAKE]
+    assert (
+        heights[0] < 2.0 and np.all(np.diff(heights[:20]) < 0) and heights[-1] == pytest.approx(0.5, abs=0.01)
+    )
+
+
 def test_ramming_topples_the_pile_and_slows_the_agent() -> None:
     env = pyramids()
     place(env, 0.0, -6.0, 0.0)
