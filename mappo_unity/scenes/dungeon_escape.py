@@ -117,7 +117,7 @@ class DungeonEscape(Scene):
         self._kill(_first(touching[:, :, DRAGON]))
         unlocked = entered & self.has_key
         self.has_key &= ~unlocked  # the key is used up before the episode's last record
-        self._unlock(unlocked.any(axis=1))
+        self._unlock(np.any(unlocked, axis=1))
         self._enter_portal(touching[:, :, PORTAL])
         escaped &= self.room.present[:, DRAGON] & (self.timer > 0)
         self._end_groups(np.flatnonzero(escaped))

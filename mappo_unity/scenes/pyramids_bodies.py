@@ -125,7 +125,7 @@ class PyramidsBodies:
         return touching
 
     def move(self, moved: np.ndarray) -> None:
-        """Advance positions by one tick; the bricks' engine has moved those of `moved` bool [N] along x, z."""
+        """Advance positions by one tick; the bricks' engine has moved `moved` bool [N] along x and z."""
         step = self.velocity * TICK_S
         step[moved, ::2] = 0.0
         self.position += step
