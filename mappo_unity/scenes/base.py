@@ -1,35 +1,13 @@
 """The stepping loop that every embedded scene stands on: Unity ML-Agents' framework rules, vectorised.
 
-In: a scene's declarations and hooks. Out: a `mlagents_envs.base_env.BaseEnv`. Knows no scene.
-
-How to write a scene (`ball3d.py` is the shortest example): subclass `Scene`, declare the class attributes,
-and implement the hooks. All hooks work on *slots* (see `agents.py`): integer arrays that select agents of
-all areas at once; slot // agents_per_area is the area. No Python loop over agents.
-
-    class MyScene(Scene):
-        NAME, DEFAULT_NUM_AREAS, MAX_STEP = "MyScene", 12, 5000
-        BEHAVIORS = (Behavior("MyScene?team=0", (Sensor("VectorSensor_size8", (8,)),), continuous=2),)
-        def __init__(self, **options):
-            super().__init__(**options)      # then build arrays and physics; do not draw numbers yet
-        def begin_episode(self, slots): ...  # OnEpisodeBegin
-        def observe(self, behavior, slots): ...  # one new float32 array [n, *shape] a sensor, unstacked
-        def act(self, slots): ...            # OnActionReceived; reads self.agents.continuous / .discrete
-        def simulate(self): ...              # physics of one tick, then collision callbacks
-        def scene_state(self), load_scene_state(self, state)
-
-One tick, in Unity's order: `fixed_update` (agents' own FixedUpdate) -> [first tick only: `begin_episode` of
-all] -> decisions asked, counters + 1, `observe` for those asked, exchange with Python if any record waits
--> `act` -> MaxStep -> `controllers` (scripts after the academy) -> `simulate`.
-Hooks change rewards and episodes with `set_reward`, `add_reward`, `add_group_reward`, `end_episode`,
-`disable`, `enable`, `switch_behavior`; all of them accept integer slots or a boolean mask over slots.
-Use Unity's numbers and axes (x right, y up, z forward) everywhere, in MuJoCo too: gravity along -y, and
-mirrored algebra is the same algebra (only MuJoCo's quaternions are w first).
+In: a scene's declarations and hooks (`hooks.py` says how to write a scene). Out: a
+`mlagents_envs.base_env.BaseEnv`. Knows no scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from mlagents_envs.base_env import (
@@ -44,51 +22,30 @@ from mlagents_envs.exception import UnityActionException, UnityEnvironmentExcept
 from mappo_unity.config import ConfigError
 from mappo_unity.scenes.action_check import ActionCheck
 from mappo_unity.scenes.agents import Agents
-from mappo_unity.scenes.records import TerminalQueue, steps_from_state, steps_state
-from mappo_unity.scenes.specs import Behavior, Parameter, checked_parameter
-from mappo_unity.scenes.stacks import Stacks
+from mappo_unity.scenes.hooks import SceneHooks
+from mappo_unity.scenes.records import Records, steps_from_state, steps_state
+from mappo_unity.scenes.specs import at_least_one, checked_parameter, checked_seed
 
 
-class Scene(BaseEnv):
+class Scene(SceneHooks, BaseEnv):
     """Run N areas of a Unity example scene under ML-Agents' rules, without Unity.
 
     Arguments of every scene: `num_areas` copies of the playing area (None: as many as Unity's scene),
     `num_threads` for physics, `seed` of the one random generator `self.rng`, and environment parameters.
     """
 
-    NAME: ClassVar[str]
-    """Name of the scene."""
-    DEFAULT_NUM_AREAS: ClassVar[int] = 1
-    """Areas of the Unity scene."""
-    BEHAVIORS: ClassVar[tuple[Behavior, ...]]
-    """Behaviors, in the order in which Unity lists them."""
-    AREA_BEHAVIORS: ClassVar[tuple[int, ...]] = (0,)
-    """First behavior (index) of each agent of an area; the order gives the agent ids."""
-    AREA_GROUPS: ClassVar[tuple[int, ...]] = (-1,)
-    """Group of each agent of an area, from 0 in creation order; -1: none (group id 0)."""
-    DECISION_PERIOD: ClassVar[int] = 5
-    """Ticks between two decisions."""
-    TAKE_ACTIONS_BETWEEN_DECISIONS: ClassVar[bool] = True
-    """Whether `act` runs every tick, or only in ticks of a decision."""
-    MAX_STEP: ClassVar[int] = 0
-    """Ticks after which an agent's episode is interrupted; 0: never."""
-    PARAMETERS: ClassVar[Mapping[str, Parameter]] = {}
-    """Environment parameters that the scene reads."""
-
     def __init__(
         self, *, num_areas: int | None = None, num_threads: int = 1, seed: int = 0, **parameters: float
     ) -> None:
-        self.num_areas = _at_least_one("num_areas", num_areas or self.DEFAULT_NUM_AREAS, num_areas)
-        self.num_threads = _at_least_one("num_threads", num_threads, num_threads)
-        self.rng = np.random.default_rng(_seed(seed))
+        self.num_areas = at_least_one("num_areas", num_areas or self.DEFAULT_NUM_AREAS, num_areas)
+        self.num_threads = at_least_one("num_threads", num_threads, num_threads)
+        self.rng = np.random.default_rng(checked_seed(seed))
         self.agents_per_area = len(self.AREA_BEHAVIORS)
         self.num_slots = self.num_areas * self.agents_per_area
         self.parameters = {name: known.default for name, known in self.PARAMETERS.items()}
         for name, value in parameters.items():
             self.parameters[name] = checked_parameter(self.NAME, self.PARAMETERS, name, value)
-        self._specs = [behavior.spec() for behavior in self.BEHAVIORS]
-        names = [behavior.name for behavior in self.BEHAVIORS]
-        self._behavior_specs = BehaviorMapping(dict(zip(names, self._specs, strict=True)))
+        self._specs = BehaviorMapping({behavior.name: behavior.spec() for behavior in self.BEHAVIORS})
         self._checks = [ActionCheck(behavior) for behavior in self.BEHAVIORS]
         self._index = {behavior.name: i for i, behavior in enumerate(self.BEHAVIORS)}
         self.agents = Agents(
@@ -98,64 +55,13 @@ class Scene(BaseEnv):
             max(behavior.continuous for behavior in self.BEHAVIORS),
             max(len(behavior.branches) for behavior in self.BEHAVIORS),
         )
-        sensors = [sensor for behavior in self.BEHAVIORS for sensor in behavior.sensors]
-        self._stacks = Stacks(sensors, self.num_slots)
-        self._is_stacked = [any(sensor.stack > 1 for sensor in b.sensors) for b in self.BEHAVIORS]
-        self._queue = TerminalQueue(self._specs)
-        self._empty = [DecisionSteps.empty(spec) for spec in self._specs]
+        self._records = Records(self.BEHAVIORS, self.agents)
         self._results: list[tuple[DecisionSteps, TerminalSteps]] = []
         self._asked = np.zeros(0, np.int64)
         self._asked_rows: list[np.ndarray] = [self._asked for _ in self.BEHAVIORS]
         self.counter = 0  # the academy's step count: ticks since the start or the last env.reset()
         self.after_tick: Callable[[], None] | None = None  # called at the end of every tick, to film it
         self._closed = False
-
-    # ---- hooks of a scene -------------------------------------------------------------------------------
-
-    def begin_episode(self, slots: np.ndarray) -> None:
-        """Begin new episodes of `slots` (OnEpisodeBegin); draw from `self.rng` here."""
-        raise NotImplementedError
-
-    def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
-        """Return one new array float32 ``[len(slots), *sensor.shape]`` a sensor, without stacking."""
-        raise NotImplementedError
-
-    def observe_all(self, slots: list[np.ndarray]) -> list[list[np.ndarray]]:
-        """Return what `observe` does for `slots` of every behavior; override to save work in common."""
-        if len(slots) == 1:
-            return [self.observe(0, slots[0])]
-        return [self.observe(behavior, rows) if rows.size else [] for behavior, rows in enumerate(slots)]
-
-    def act(self, slots: np.ndarray) -> None:
-        """Execute the stored actions of `slots`; give rewards, end episodes (OnActionReceived)."""
-        raise NotImplementedError
-
-    def simulate(self) -> None:
-        """Advance physics by one tick, then handle contacts; those may end episodes too."""
-
-    def fixed_update(self) -> None:
-        """Run the agents' own FixedUpdate, before the academy's step of this tick."""
-
-    def controllers(self) -> None:
-        """Run scripts that follow the academy's step (area timers), before physics."""
-
-    def decides(self) -> bool | np.ndarray:
-        """Return who asks for a decision this tick: all, none, or a mask bool over slots."""
-        return self.counter % self.DECISION_PERIOD == 0
-
-    def action_mask(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
-        """Return one bool ``[len(slots), branch size]`` a discrete branch, True = forbidden."""
-        return [np.zeros((len(slots), size), bool) for size in self.BEHAVIORS[behavior].branches]
-
-    def parameter_changed(self, name: str) -> None:
-        """Apply a parameter that acts at once (gravity); others are read at the next reset."""
-
-    def scene_state(self) -> dict[str, Any]:
-        """Return everything of the scene that a snapshot needs, as numpy arrays and plain values."""
-        return {}
-
-    def load_scene_state(self, state: dict[str, Any]) -> None:
-        """Restore what `scene_state` returned."""
 
     # ---- what hooks call --------------------------------------------------------------------------------
 
@@ -200,7 +106,7 @@ class Scene(BaseEnv):
         slots = slots[keep]
         if slots.size:
             self.agents.enable(slots, group_ids[keep] if isinstance(group_ids, np.ndarray) else group_ids)
-            self._stacks.clear(slots)
+            self._records.clear_stacks(slots)
             if self.started:
                 self.begin_episode(slots)
 
@@ -232,7 +138,7 @@ class Scene(BaseEnv):
     @property
     def behavior_specs(self) -> BehaviorMapping:
         """Return the specs of all behaviors, complete from the start."""
-        return self._behavior_specs
+        return self._specs
 
     def reset(self) -> None:
         """Reset as Unity's academy does: the first time tick 0, later at the exchange of a running tick.
@@ -302,7 +208,7 @@ class Scene(BaseEnv):
             "rng": self.rng.bit_generator.state,
             "parameters": dict(self.parameters),
             "agents": self.agents.get_state(),
-            "stacks": self._stacks.get_state(),
+            "stacks": self._records.get_state(),
             "asked": self._asked.copy(),
             "results": [[steps_state(d), steps_state(t)] for d, t in self._results],
             "state": self.scene_state(),
@@ -320,8 +226,7 @@ class Scene(BaseEnv):
         self.rng.bit_generator.state = state["rng"]
         self.parameters = dict(state["parameters"])
         self.agents.set_state(state["agents"])
-        self._stacks.set_state(state["stacks"])
-        self._queue.clear()
+        self._records.set_state(state["stacks"])
         self._results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]
         self._set_asked(state["asked"].copy())
         self.load_scene_state(state["state"])
@@ -345,7 +250,7 @@ class Scene(BaseEnv):
             self._set_asked(agents.order[:0] if decides is False else agents.order[decides[agents.order]])
         self.counter += 1
         agents.count_tick()
-        if not self._asked.size and not len(self._queue) and self.started:
+        if not self._asked.size and not len(self._records) and self.started:
             return False
         frames = self.observe_all(self._asked_rows) if self._asked.size else [[] for _ in self.BEHAVIORS]
         self._results = list(map(self._result, range(len(frames)), frames))
@@ -367,51 +272,19 @@ class Scene(BaseEnv):
             self.after_tick()
 
     def _result(self, behavior: int, frames: list[np.ndarray]) -> tuple[DecisionSteps, TerminalSteps]:
-        terminals = self._queue.take(behavior)
         slots = self._asked_rows[behavior]
-        if not slots.size:
-            return self._empty[behavior], terminals
-        agents = self.agents
-        decisions = DecisionSteps(
-            self._observations(behavior, slots, frames),
-            agents.reward[slots],
-            agents.agent_id[slots],
-            self.action_mask(behavior, slots) if self.BEHAVIORS[behavior].branches else None,
-            agents.group_id[slots],
-            agents.group_reward[slots],
-        )
-        agents.reward[slots] = 0
-        agents.group_reward[slots] = 0
-        agents.done[slots] = False
-        return decisions, terminals
-
-    def _observations(self, behavior: int, slots: np.ndarray, frames: list[np.ndarray]) -> list[np.ndarray]:
-        """Put new frames on the stacks and return what the sensors show."""
-        if not self._is_stacked[behavior]:
-            return frames
-        sensors = self.BEHAVIORS[behavior].sensors
-        push = self._stacks.push
-        return [push(sensor, slots, frame) for sensor, frame in zip(sensors, frames, strict=True)]
+        discrete = self.BEHAVIORS[behavior].branches and slots.size
+        mask = self.action_mask(behavior, slots) if discrete else None
+        decisions = self._records.decisions(behavior, slots, frames, mask)
+        return decisions, self._records.take_terminals(behavior)
 
     def _send_terminals(self, slots: np.ndarray, interrupted: bool) -> None:
         agents = self.agents
         slots = slots[~agents.done[slots]]
-        if not slots.size:
-            return
         for behavior in range(len(self.BEHAVIORS)):
             rows = slots if len(self.BEHAVIORS) == 1 else slots[agents.behavior[slots] == behavior]
             if rows.size:
-                steps = TerminalSteps(
-                    self._observations(behavior, rows, self.observe(behavior, rows)),
-                    agents.reward[rows],
-                    np.full(rows.size, interrupted),
-                    agents.agent_id[rows],
-                    agents.group_id[rows],
-                    agents.group_reward[rows],
-                )
-                self._queue.add(behavior, steps)
-        self._stacks.clear(slots)
-        agents.finish(slots)
+                self._records.end(behavior, rows, self.observe(behavior, rows), interrupted)
 
     def _set_asked(self, slots: np.ndarray) -> None:
         self._asked = slots
@@ -445,15 +318,3 @@ class Scene(BaseEnv):
 def _as_slots(slots: np.ndarray) -> np.ndarray:
     slots = np.asarray(slots)
     return np.flatnonzero(slots) if slots.dtype == bool else slots.reshape(-1)
-
-
-def _at_least_one(option: str, value: int, given: object) -> int:
-    if isinstance(given, bool) or not isinstance(value, (int, np.integer)) or value < 1 or given == 0:
-        raise ConfigError(f"{option}={given!r} must be a whole number >= 1")
-    return int(value)
-
-
-def _seed(seed: int) -> int:
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ConfigError(f"seed={seed!r} must be a whole number >= 0")
-    return int(seed)

@@ -11,6 +11,7 @@ import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 from mlagents_envs.base_env import (
     ActionSpec,
     BehaviorSpec,
@@ -92,3 +93,17 @@ def checked_parameter(scene: str, known: Mapping[str, Parameter], name: str, val
             f"parameter {name}={value} of scene {scene} is out of range: it must be > {known[name].above:g}"
         )
     return number
+
+
+def at_least_one(option: str, value: int, given: object) -> int:
+    """Return `value` as an int, or raise `ConfigError` that shows what was `given`; 0 is no default."""
+    if isinstance(given, bool) or not isinstance(value, (int, np.integer)) or value < 1 or given == 0:
+        raise ConfigError(f"{option}={given!r} must be a whole number >= 1")
+    return int(value)
+
+
+def checked_seed(seed: int) -> int:
+    """Return `seed` as an int, or raise `ConfigError`."""
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ConfigError(f"seed={seed!r} must be a whole number >= 0")
+    return int(seed)
