@@ -20,7 +20,6 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from mappo_unity import checkpoint
-from mappo_unity.backend import make_env_function
 from mappo_unity.behavior_options import options_of
 from mappo_unity.build import batch_rounds, make_learners, make_unity_env, prepare_torch
 from mappo_unity.collect import make_collector
@@ -29,11 +28,10 @@ from mappo_unity.drops import drop_episodes
 from mappo_unity.export import RunExports, sample_inputs
 from mappo_unity.fit import check_fits, describe_models, describe_policies
 from mappo_unity.log import RunLog, check_backends
-from mappo_unity.matches import Score, play_matches
 from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
 from mappo_unity.models import JointPolicy
-from mappo_unity.policies import ActorPolicy, RandomPolicy
 from mappo_unity.rng import get_rng_state, set_rng_state
+from mappo_unity.series import MatchSeries
 from mappo_unity.transforms import transformed
 
 
@@ -81,8 +79,7 @@ class Trainer:
         self.restarts_before = self.dropped_episodes = self.dropped_steps = 0
         self.saved_at = 0
         self.best_score = -math.inf
-        self.matched_at = 0
-        self.win_rate = math.nan
+        self.matches = MatchSeries(cfg, folder)
         self.last_checkpoint: Path | None = None
         self.stop_signal: int | None = None
         self.resumed = False
@@ -159,15 +156,17 @@ class Trainer:
             "update_s": end - collected,
         }
         self._report(learned)
-        learned |= self._play_matches()
+        matches = self._play_matches()
         self._log_row(
             {"episodes": self.window.total, "episodes_new": episodes}
             | self.window.summary()
             | times
             | troubles
             | learned
+            | matches
         )
-        if self.agent_steps - self.saved_at >= self.cfg.checkpoint_interval:
+        new_best = bool(matches) and self._score() > self.best_score  # these weights, not those of later on
+        if new_best or self.agent_steps - self.saved_at >= self.cfg.checkpoint_interval:
             self.save()
 
     def _drop_cut_off(self, batch: TensorDictBase) -> dict[str, float]:
@@ -220,25 +219,11 @@ class Trainer:
             )
 
     def _play_matches(self) -> dict[str, float]:
-        """Play a series against a random side when it is time; training's random numbers stay untouched."""
-        interval = self.cfg.matches.interval
-        if interval is None or self.agent_steps - self.matched_at < interval:
+        """Play a series of matches when it is due."""
+        if not self.matches.is_due(self.agent_steps):
             return {}
-        self.matched_at = self.agent_steps
         actors = {name: learner.actor for name, learner in self.learners.items()}
-        player = ActorPolicy(self._layout(), actors, False, "the policy")
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.cfg.seed + self.agent_steps)
-            make_env = make_env_function(self.cfg.env, self.folder / "players" / "matches")
-            seed = (self.cfg.seed + self.agent_steps) % 2**31
-            scores = play_matches(make_env, player, RandomPolicy(seed), self.cfg.matches.count, seed)
-        total = sum(scores.values(), Score())
-        self.win_rate = total.figures()["won_of_decided"]
-        return {
-            "win_rate_vs_random": self.win_rate,
-            "draw_rate_vs_random": total.draws / max(1, total.matches),
-            "match_decisions_vs_random": total.decisions / max(1, total.matches),
-        }
+        return self.matches.play(self.agent_steps, self._layout(), actors)
 
     def _score(self) -> float:
         """What the best checkpoint is chosen by: return_mean, or the win rate where two sides share a policy.
@@ -246,7 +231,8 @@ class Trainer:
         (There one side's gain is the other's loss, and the mean return says nothing.)
         """
         if any(len(sides) > 1 for sides in self.env.sides.values()):
-            return self.win_rate if math.isfinite(self.win_rate) else float(self.agent_steps) * 1e-12
+            rate = self.matches.win_rate
+            return rate if math.isfinite(rate) else float(self.agent_steps) * 1e-12
         return self.window.summary()["return_mean"]
 
     def _status(self) -> str | None:
@@ -292,6 +278,7 @@ class Trainer:
             "learners": {name: learner.state_dict() for name, learner in self.learners.items()},
             "env": self.env.get_state(),
             "window": self.window.state_dict(),
+            "matches": self.matches.state_dict(),
             "rng": get_rng_state(),
             "samples": self.samples,
             **{name: getattr(self, name) for name in self._COUNTERS},
@@ -299,7 +286,7 @@ class Trainer:
         }
 
     _COUNTERS = (
-        *("iteration", "agent_steps", "wall_s", "saved_at", "best_score", "matched_at", "win_rate"),
+        *("iteration", "agent_steps", "wall_s", "saved_at", "best_score"),
         *("restarts_before", "dropped_episodes", "dropped_steps"),
     )
 
@@ -316,6 +303,7 @@ class Trainer:
         if state["env"] is not None:
             self.env.set_state(checkpoint.to_arrays(state["env"]))
         self.window.load_state_dict(state["window"])
+        self.matches.load_state_dict(state["matches"])
         for name in self._COUNTERS:
             setattr(self, name, state[name])
         self._rng_state = state["rng"]

@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mappo_unity import checkpoint
+from mappo_unity import checkpoint, series
 from mappo_unity.checkpoint import CheckpointError
 from mappo_unity.config import (
     CollectConfig,
@@ -20,14 +20,17 @@ from mappo_unity.config import (
     ConfigError,
     EnvConfig,
     LogConfig,
+    MatchConfig,
     ModelConfig,
     PPOConfig,
 )
+from mappo_unity.matches import Score
 from mappo_unity.train import Trainer, train
 
 TIMES = {"wall_s", "steps_per_s", "collect_s", "update_s"}
 AREAS, ROUNDS = 6, 20
 BATCH = AREAS * ROUNDS
+SOCCER_BATCH = 2 * 4 * ROUNDS
 TINY = [
     "env=3DBall",
     f"env.num_areas={AREAS}",
@@ -49,6 +52,16 @@ def options(iterations, **changes):
         checkpoint_interval=BATCH,
     )
     return replace(cfg, **changes)
+
+
+def soccer(iterations, **changes):
+    return options(
+        iterations,
+        env=EnvConfig(name="SoccerTwos", num_areas=2),
+        matches=MatchConfig(interval=2 * SOCCER_BATCH, count=2),
+        max_steps=iterations * SOCCER_BATCH,
+        **changes,
+    )
 
 
 def rows(folder):
@@ -218,3 +231,24 @@ def test_twenty_kills_end_like_an_undisturbed_run(tmp_path):
     assert process.returncode == 0, errors
     assert rows(folder / "run") == rows(tmp_path / "whole" / "run")
     assert kills == 20
+
+
+def test_the_best_checkpoint_of_a_two_sided_run_has_the_weights_that_won_most(tmp_path, monkeypatch):
+    scores = iter([Score(wins=3, losses=7), Score(wins=8, losses=2), Score(wins=6, losses=4)])
+    monkeypatch.setattr(series, "play_matches", lambda *args: {"blue": next(scores)})
+    train(soccer(5, checkpoint_interval=10**6), tmp_path)
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        won = [row["win_rate_vs_random"] for row in csv.DictReader(file)]
+    assert won == ["", "0.3", "", "0.8", "0.6"]  # every second iteration, and after the last one
+    best = checkpoint.load(tmp_path / "checkpoints" / "best.pt")
+    assert best["agent_steps"] == 4 * SOCCER_BATCH
+
+
+def test_a_series_at_the_end_leaves_the_rhythm_of_a_longer_run_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(series, "play_matches", lambda *args: {"blue": Score(wins=1)})
+    first = train(soccer(3), tmp_path / "a")
+    assert first.last_checkpoint is not None
+    train(soccer(5), tmp_path / "a", first.last_checkpoint)
+    with open(tmp_path / "a" / "metrics.csv", newline="") as file:
+        won = [row["win_rate_vs_random"] for row in csv.DictReader(file)]
+    assert won == ["", "1.0", "1.0", "1.0", "1.0"]
