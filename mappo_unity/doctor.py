@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from mappo_unity.arguments import check_duration, check_range
 from mappo_unity.config import ConfigError, EnvironmentFailure
-from mappo_unity.player_build import check_range
 
 PACKAGES = ("torch", "torchrl", "tensordict", "mlagents-envs", "protobuf", "grpcio", "numpy", "mujoco")
 EDITOR_PORT = 5004
@@ -52,9 +52,8 @@ def diagnose(arguments: Sequence[str], say: Say) -> int:
     """
     options = _parser().parse_args(arguments)
     check_range("--port", options.port, 1, 65535)
-    for name, value in (("--timeout-s", options.timeout_s), ("--seconds", options.seconds)):
-        if not 0 < value < float("inf"):
-            raise ConfigError(f"{name} {value:g} is out of range: it must be > 0")
+    check_duration("--timeout-s", options.timeout_s)
+    check_duration("--seconds", options.seconds)
     report = Report(say)
     report.head("installation")
     examine_packages(report)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
-from mappo_unity.onnx_policy import OnnxFolder, OnnxPolicy
 from mappo_unity.policies import Policy
 from mappo_unity.rounds import Episode
 
@@ -39,10 +38,7 @@ def play(
             _drop_cut_off(env, name, running, counts)
             _end_episodes(name, terminal, running, counts)
             actor = policy[name] if isinstance(policy, dict) else policy
-            if isinstance(
-                actor, (OnnxPolicy, OnnxFolder)
-            ):  # it may remember what agents saw in their last episode
-                actor.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
+            actor.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
             _go_on(name, decision, running, counts)
             if len(decision):
                 env.set_actions(name, actor.act(name, decision, env.behavior_specs[name]))

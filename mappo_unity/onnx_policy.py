@@ -191,6 +191,10 @@ class OnnxFolder:
         """Return an action for every row of ``steps``."""
         return self._policy(behavior).act(behavior, steps, spec)
 
+    def check(self, behavior: str, spec: BehaviorSpec) -> None:
+        """Raise ConfigError if there is no file for that behavior, or one that cannot play it."""
+        self._policy(behavior).check(behavior, spec)
+
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
         """Drop the memory of agents that begin an episode."""
         self._policy(behavior).forget(behavior, agent_ids)

@@ -12,14 +12,11 @@ from typing import Any, Protocol
 
 import torch
 
-from mappo_unity import keys
 from mappo_unity.backend import make_env_function
 from mappo_unity.compose import config_to_play
 from mappo_unity.config import Backend, ConfigError, PlayConfig
 from mappo_unity.evaluate import open_policy
-from mappo_unity.onnx_policy import SUFFIX, OnnxPolicy
-from mappo_unity.policies import ActorPolicy, Policy
-from mappo_unity.runs import CONFIG
+from mappo_unity.policies import Policy
 from mappo_unity.scenes.base import Scene
 from mappo_unity.scenes.drawings import drawing_of
 from mappo_unity.scenes.drawings.shapes import Camera, Drawing, Shape
@@ -54,16 +51,16 @@ def play(cfg: PlayConfig) -> dict[str, Any]:
     torch.manual_seed(cfg.seed)
     scene = open_scene(cfg)
     try:
-        policies = policies_of(cfg, scene)
+        policy = policy_of(cfg, scene)
         drawing = drawing_of(scene.NAME)
         pace = Pace(drawing, cfg.seconds)
         first, size = _camera(drawing, scene), (cfg.width, cfg.height)
         if video is not None:
             with VideoFile(video, first, size, pace.fps) as file:
-                figures = _roll(scene, policies, Projector(scene, drawing, pace, file))
+                figures = _roll(scene, policy, Projector(scene, drawing, pace, file))
         else:
             with Window(first, size, pace.fps, f"mappo-play {scene.NAME}") as window:
-                figures = _roll(scene, policies, Projector(scene, drawing, pace, window))
+                figures = _roll(scene, policy, Projector(scene, drawing, pace, window))
     finally:
         scene.close()
     return {"scene": scene.NAME, "policy": cfg.run or cfg.policy or RANDOM, "video": cfg.video} | figures
@@ -81,22 +78,14 @@ def open_scene(cfg: PlayConfig) -> Scene:
     return scene
 
 
-def policies_of(cfg: PlayConfig, scene: Scene) -> dict[str, Policy]:
-    """Return the policy of every behavior, checked against it."""
-    where = cfg.run or cfg.policy or RANDOM
-    folder = Path(where)
-    if folder.is_dir() and not (folder / CONFIG).is_file() and any(folder.glob(f"*{SUFFIX}")):
-        paths = {name: folder / f"{keys.policy_name(name)}{SUFFIX}" for name in scene.behavior_specs}
-        policies: dict[str, Policy] = {
-            name: OnnxPolicy(path, cfg.deterministic, cfg.seed) for name, path in paths.items()
-        }
-    else:
-        policy = open_policy(where, cfg.deterministic, cfg.seed, "run" if cfg.run else "policy")
-        policies = dict.fromkeys(scene.behavior_specs, policy)
-    for name, plays in policies.items():
-        if isinstance(plays, (ActorPolicy, OnnxPolicy)):
-            plays.check(name, scene.behavior_specs[name])
-    return policies
+def policy_of(cfg: PlayConfig, scene: Scene) -> Policy:
+    """Return the policy, checked against every behavior."""
+    policy = open_policy(
+        cfg.run or cfg.policy or RANDOM, cfg.deterministic, cfg.seed, "run" if cfg.run else "policy"
+    )
+    for name, spec in scene.behavior_specs.items():
+        policy.check(name, spec)
+    return policy
 
 
 class Pace:
@@ -127,27 +116,26 @@ class Projector:
         self.over = not wanted or self.frames >= self.pace.frames
 
 
-def _roll(scene: Scene, policies: dict[str, Policy], projector: Projector) -> dict[str, Any]:
+def _roll(scene: Scene, policy: Policy, projector: Projector) -> dict[str, Any]:
     """Play until the film is over."""
     scene.after_tick = projector.tick
     returns: list[float] = []
     running: dict[tuple[str, int], float] = {}
     scene.reset()
     while not projector.over:
-        for name, policy in policies.items():
+        for name, spec in scene.behavior_specs.items():
             decisions, terminals = scene.get_steps(name)
             rewards = (terminals.reward + terminals.group_reward).tolist()
             for agent, reward in zip(terminals.agent_id.tolist(), rewards):
                 if (name, agent) in running:
                     returns.append(running.pop((name, agent)) + reward)
             agents = decisions.agent_id.tolist()
-            if isinstance(policy, OnnxPolicy):
-                policy.forget(name, [agent for agent in agents if (name, agent) not in running])
+            policy.forget(name, [agent for agent in agents if (name, agent) not in running])
             rewards = (decisions.reward + decisions.group_reward).tolist()
             for agent, reward in zip(agents, rewards):
                 running[name, agent] = running.get((name, agent), 0.0) + reward
             if agents:
-                scene.set_actions(name, policy.act(name, decisions, scene.behavior_specs[name]))
+                scene.set_actions(name, policy.act(name, decisions, spec))
         scene.step()
     mean = sum(returns) / len(returns) if returns else None
     return {

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TextIO
 
+from mappo_unity.arguments import check_range
 from mappo_unity.config import ConfigError
 from mappo_unity.protobuf import install
 
@@ -27,7 +28,7 @@ from mlagents_envs.base_env import BaseEnv  # noqa: E402
 from mappo_unity import __version__  # noqa: E402
 from mappo_unity.link import encode, messages, side_channels  # noqa: E402
 from mappo_unity.link.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
-from mappo_unity.player_build import build, check_range  # noqa: E402
+from mappo_unity.player_build import build  # noqa: E402
 
 EDITOR_PORT = 5004
 """Port on which a trainer waits for the Editor, used when no --mlagents-port is given."""

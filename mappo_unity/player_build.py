@@ -40,13 +40,6 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
     return path
 
 
-def check_range(name: str, value: int, low: int, high: int | None = None) -> None:
-    """Raise ConfigError if the value of a command's option is out of range."""
-    if value < low or (high is not None and value > high):
-        rule = f"at least {low}" if high is None else f"from {low} to {high}"
-        raise ConfigError(f"{name} {value} is out of range: it must be {rule}")
-
-
 def _executable(folder: Path, name: str) -> Path:
     if sys.platform == "win32":
         raise ConfigError(

@@ -5,6 +5,7 @@ In: the records of a BaseEnv. Out: ActionTuples. Used to play, not to learn.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -22,7 +23,15 @@ from mappo_unity.models import make_actor
 
 
 class Policy(Protocol):
-    """Choose actions for the agents of one behavior."""
+    """Choose actions for the agents of an environment's behaviors."""
+
+    def check(self, behavior: str, spec: BehaviorSpec) -> None:
+        """Raise ConfigError if this policy cannot play that behavior."""
+        ...
+
+    def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Drop the memory of agents that begin an episode."""
+        ...
 
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
         """Return an action for every row of ``steps``, in their order."""
@@ -34,6 +43,12 @@ class RandomPolicy:
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
+
+    def check(self, behavior: str, spec: BehaviorSpec) -> None:
+        """Accept every behavior."""
+
+    def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Remember nothing."""
 
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
         """Return an action for every row of ``steps``."""
@@ -93,6 +108,9 @@ class ActorPolicy:
                 f"{self.name} cannot play {behavior!r}: it was trained for {self.layout}, "
                 f"but the environment has {found}"
             )
+
+    def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Remember nothing."""
 
 
 class CheckpointPolicy(ActorPolicy):

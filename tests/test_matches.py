@@ -51,7 +51,7 @@ class Duel(BaseEnv):
         return decision, TerminalSteps(obs, zeros, np.zeros(2, bool), ids, groups, reward)
 
 
-class Always:
+class Always(RandomPolicy):
     def __init__(self, choice):
         self.choice = choice
 

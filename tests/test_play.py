@@ -23,7 +23,8 @@ from mappo_unity.config import (
     PlayConfig,
     PPOConfig,
 )
-from mappo_unity.play import Pace, open_scene, play, policies_of
+from mappo_unity.onnx_policy import OnnxFolder
+from mappo_unity.play import Pace, open_scene, play, policy_of
 from mappo_unity.render import Renderer
 from mappo_unity.scenes.drawings import drawing_of
 from mappo_unity.scenes.drawings.shapes import (
@@ -184,13 +185,16 @@ def test_a_run_is_filmed_from_the_command_line(
 def test_a_folder_of_onnx_files_plays_every_behavior(shared: Path) -> None:
     cfg = PlayConfig(env="WallJump", policy=str(shared / "oracle"))
     scene = open_scene(cfg)
-    policies = policies_of(cfg, scene)
-    assert scene.num_areas == 1
-    names = {name: Path(str(vars(policy)["path"])).name for name, policy in policies.items()}
-    assert names == {"SmallWallJump?team=0": "SmallWallJump.onnx", "BigWallJump?team=0": "BigWallJump.onnx"}
+    policy = policy_of(cfg, scene)
+    assert scene.num_areas == 1 and isinstance(policy, OnnxFolder)
+    cfg = PlayConfig(env="Basic", policy=str(shared / "oracle"))
+    with pytest.raises(
+        ConfigError, match=r"'Basic\?team=0' needs a file .*Basic.onnx; there are 3DBall.onnx"
+    ):
+        policy_of(cfg, open_scene(cfg))
     cfg = PlayConfig(env="Basic", policy=str(shared / "oracle" / "3DBall.onnx"))
     with pytest.raises(ConfigError, match=r"3DBall.onnx cannot play 'Basic\?team=0'"):
-        policies_of(cfg, open_scene(cfg))
+        policy_of(cfg, open_scene(cfg))
 
 
 @pytest.mark.skipif("DISPLAY" not in os.environ, reason="needs a display (xvfb-run pytest ...)")
