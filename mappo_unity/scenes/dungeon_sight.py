@@ -32,7 +32,8 @@ from mappo_unity.scenes.dungeon_layout import (
 )
 from mappo_unity.scenes.dungeon_room import DungeonRoom
 from mappo_unity.scenes.ground import CONTACT_GAP
-from mappo_unity.scenes.rays import RaySensor, cast_rectangles, cast_spheres, flat_radius, passes
+from mappo_unity.scenes.ray_sensor import RaySensor
+from mappo_unity.scenes.rays import cast_rectangles, cast_spheres, flat_radius, passes
 
 WALL_TAG, AGENT_TAG, DRAGON_TAG, KEY_TAG, LOCK_TAG, PORTAL_TAG = range(6)
 EYES = RaySensor(tags=6, rays_per_side=7, max_degrees=60, length=40)

@@ -13,7 +13,8 @@ import numpy as np
 
 from mappo_unity.scenes.base import Scene
 from mappo_unity.scenes.ground import CONTACT_GAP, TICK_S, axis_gaps, box_gap, slide, stop
-from mappo_unity.scenes.rays import RaySensor, cast_rectangles, flat_radius
+from mappo_unity.scenes.ray_sensor import RaySensor
+from mappo_unity.scenes.rays import cast_rectangles, flat_radius
 from mappo_unity.scenes.specs import Behavior, Parameter, Sensor
 
 AGENT_HALF = (0.5, 0.5, 0.5)

@@ -13,7 +13,8 @@ from mappo_unity.scenes.ground import CONTACT_GAP
 from mappo_unity.scenes.pyramids_bodies import NUM_STONES, SWITCH_HALF, PyramidsBodies
 from mappo_unity.scenes.pyramids_bricks import HALVES, NUM_BODIES, PyramidsBricks
 from mappo_unity.scenes.pyramids_layout import BRICKS, INNER_WALLS, OUTER_WALLS, STONE_LAYERS
-from mappo_unity.scenes.rays import RaySensor, cast_boxes, cast_upright_boxes, passes
+from mappo_unity.scenes.ray_sensor import RaySensor
+from mappo_unity.scenes.rays import cast_boxes, cast_upright_boxes, passes
 
 BLOCK_TAG, WALL_TAG, GOAL_TAG, SWITCH_OFF_TAG, SWITCH_ON_TAG, STONE_TAG = range(6)
 EYES = tuple(

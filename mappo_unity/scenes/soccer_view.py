@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mappo_unity.scenes.rays import RaySensor
+from mappo_unity.scenes.ray_sensor import RaySensor
 from mappo_unity.scenes.soccer_casts import Walls, cast_discs, first_met, numbered, unmet_discs
 from mappo_unity.scenes.soccer_physics import AGENT_RADIUS, BALL_RADIUS, SoccerPhysics
 from mappo_unity.scenes.soccer_pitch import (

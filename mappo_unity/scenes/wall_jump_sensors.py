@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mappo_unity.scenes.rays import RaySensor, cast_boxes, cast_rectangles, flat_radius
+from mappo_unity.scenes.ray_sensor import RaySensor
+from mappo_unity.scenes.rays import cast_boxes, cast_rectangles, flat_radius
 from mappo_unity.scenes.wall_jump_bodies import (
     BLOCK_HALF,
     FLOOR_Y,
