@@ -138,6 +138,8 @@ class EnvConfig:
     """Agent slots of a team; null: the largest team seen at the start."""
     max_teams: Optional[int] = None
     """Team slots of a behavior; null: as many as are seen at the start."""
+    note: Optional[str] = None
+    """Said when a training begins: what the environment needs and the trainer does not have."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w.-]*\w[\w.-]*", self.name):

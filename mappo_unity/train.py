@@ -94,6 +94,8 @@ class Trainer:
         """Iterate until the steps are done, the return is reached or a signal comes."""
         resume_steps = self.agent_steps if self.resumed else None
         self.log = RunLog(self.cfg.log, self.folder, self.cfg.max_steps, resume_steps)
+        if self.cfg.env.note is not None:
+            self.log.message(f"note: {self.cfg.env.note}")
         if self.cfg.export_onnx:
             self.exports = RunExports(self.folder, self.log.message)
         collector = self.make_collector()

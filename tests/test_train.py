@@ -14,6 +14,7 @@ import torch
 
 from mappo_unity import checkpoint, series
 from mappo_unity.checkpoint import CheckpointError
+from mappo_unity.compose import compose_config
 from mappo_unity.config import (
     CollectConfig,
     Config,
@@ -252,3 +253,11 @@ def test_a_series_at_the_end_leaves_the_rhythm_of_a_longer_run_alone(tmp_path, m
     with open(tmp_path / "a" / "metrics.csv", newline="") as file:
         won = [row["win_rate_vs_random"] for row in csv.DictReader(file)]
     assert won == ["", "1.0", "1.0", "1.0", "1.0"]
+
+
+def test_a_training_says_what_the_environment_needs_and_the_trainer_lacks(tmp_path, capfd):
+    note = "this needs a memory"
+    train(options(1, env=EnvConfig(num_areas=AREAS, note=note)), tmp_path)
+    assert f"note: {note}" in capfd.readouterr().out
+    for name in ("Hallway", "Pyramids"):
+        assert "this trainer has no" in str(compose_config([f"env={name}"]).config.env.note)
