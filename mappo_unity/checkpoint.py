@@ -23,7 +23,7 @@ import torch
 from mappo_unity.atomic import write_atomically
 from mappo_unity.config import ConfigError
 
-FORMAT = 1
+FORMAT = 2
 FOLDER = "checkpoints"
 BEST = "best.pt"
 _NAME = "step_{:012d}.pt"
@@ -101,7 +101,8 @@ def load(path: Path) -> dict[str, Any]:
             f"checkpoint {path} is damaged or no checkpoint of mappo-unity: {reason}"
         ) from error
     if not isinstance(state, dict) or state.get("format") != FORMAT:
-        raise CheckpointError(f"checkpoint {path} has another format than this version reads ({FORMAT})")
+        found = state.get("format") if isinstance(state, dict) else None
+        raise CheckpointError(f"checkpoint {path} has format {found}, but this version reads format {FORMAT}")
     return state
 
 

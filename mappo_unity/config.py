@@ -328,7 +328,7 @@ class MatchConfig:
     """Matches against a random side while training, for environments with two sides."""
 
     interval: Optional[int] = None
-    """Agent decisions between two series of matches, with one more at the end; null: none."""
+    """Agent decisions between two series of matches, with one more when max_steps are done; null: none."""
     count: int = 64
     """Matches in a series, half of them on each side."""
 

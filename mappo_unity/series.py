@@ -1,33 +1,50 @@
 """Series of matches against a random side while a policy learns: when they are played, what they said.
 
-In: the run's options, the actors. Out: figures for the metrics, the newest win rate. Knows no learner.
+In: the run's options, the actors. Out: figures for the metrics, a score. Knows no learner.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from mappo_unity.backend import make_env_function
-from mappo_unity.config import Config
+from mappo_unity.config import Config, ConfigError
+from mappo_unity.keys import team_id
 from mappo_unity.matches import Score, play_matches
 from mappo_unity.models import UnityActor
 from mappo_unity.policies import ActorPolicy, RandomPolicy
 
 
 class MatchSeries:
-    """Play a series every `matches.interval` agent decisions, and after the last one.
+    """Play a series every `matches.interval` agent decisions, and one when `max_steps` are done.
 
-    Attributes: `win_rate`, won of decided matches of the newest series; NaN: none yet, or all drawn.
+    Args:
+        cfg: the run's options.
+        folder: the run's folder.
+        behaviors: full behavior names of the environment.
+
+    Attributes: `two_sided`, whether the environment has two sides; `points`, of the newest series: the share
+    of its matches won, draws counted half; None: none has been played.
+
+    Raises:
+        ConfigError: series are wanted, but there are not two sides.
     """
 
-    def __init__(self, cfg: Config, folder: Path) -> None:
+    def __init__(self, cfg: Config, folder: Path, behaviors: Iterable[str]) -> None:
+        names = list(behaviors)
         self._cfg, self._folder = cfg, folder
         self._played_at = 0
-        self.win_rate = math.nan
+        self.points: float | None = None
+        self.two_sided = len({team_id(name) for name in names}) == 2
+        if cfg.matches.interval is not None and not self.two_sided:
+            raise ConfigError(
+                f"matches.interval={cfg.matches.interval}: matches need an environment with two sides (team "
+                f"ids), and {cfg.env.name} has {', '.join(names)}; matches.interval=null plays none"
+            )
 
     def is_due(self, agent_steps: int) -> bool:
         """Return whether a series is to be played now."""
@@ -39,30 +56,35 @@ class MatchSeries:
     ) -> dict[str, float]:
         """Play a series and return its figures; the random numbers of training stay untouched."""
         cfg = self._cfg
-        if self._interval_is_over(agent_steps):  # the last series leaves the rhythm of a longer run alone
-            self._played_at = agent_steps
         player = ActorPolicy(layout, actors, False, "the policy")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(cfg.seed + agent_steps)
             make_env = make_env_function(cfg.env, self._folder / "players" / "matches")
             seed = (cfg.seed + agent_steps) % 2**31
             scores = play_matches(make_env, player, RandomPolicy(seed), cfg.matches.count, seed)
+        if self._interval_is_over(agent_steps):  # the last series leaves the rhythm of a longer run alone
+            self._played_at = agent_steps
         total = sum(scores.values(), Score())
-        self.win_rate = total.figures()["won_of_decided"]
+        matches = max(1, total.matches)
+        self.points = (total.wins + 0.5 * total.draws) / matches
         return {
-            "win_rate_vs_random": self.win_rate,
-            "draw_rate_vs_random": total.draws / max(1, total.matches),
-            "match_decisions_vs_random": total.decisions / max(1, total.matches),
+            "win_rate_vs_random": total.figures()["won_of_decided"],
+            "draw_rate_vs_random": total.draws / matches,
+            "match_decisions_vs_random": total.decisions / matches,
         }
+
+    def score(self, agent_steps: int) -> float:
+        """Return what a two-sided run's best checkpoint is chosen by; before any series newer is better."""
+        return agent_steps * 1e-12 - 1.0 if self.points is None else self.points
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what continuing needs."""
+        return {"played_at": self._played_at, "points": self.points}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self._played_at, self.points = state["played_at"], state["points"]
 
     def _interval_is_over(self, agent_steps: int) -> bool:
         interval = self._cfg.matches.interval
         return interval is not None and agent_steps - self._played_at >= interval
-
-    def state_dict(self) -> dict[str, float]:
-        """Return what continuing needs."""
-        return {"played_at": self._played_at, "win_rate": self.win_rate}
-
-    def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restore what `state_dict` returned."""
-        self._played_at, self.win_rate = int(state["played_at"]), state["win_rate"]

@@ -79,7 +79,7 @@ class Trainer:
         self.restarts_before = self.dropped_episodes = self.dropped_steps = 0
         self.saved_at = 0
         self.best_score = -math.inf
-        self.matches = MatchSeries(cfg, folder)
+        self.matches = MatchSeries(cfg, folder, self.env.behaviors)
         self.last_checkpoint: Path | None = None
         self.stop_signal: int | None = None
         self.resumed = False
@@ -158,18 +158,16 @@ class Trainer:
             "update_s": end - collected,
         }
         self._report(learned)
-        matches = self._play_matches()
-        self._log_row(
-            {"episodes": self.window.total, "episodes_new": episodes}
-            | self.window.summary()
-            | times
-            | troubles
-            | learned
-            | matches
-        )
-        new_best = bool(matches) and self._score() > self.best_score  # these weights, not those of later on
-        if new_best or self.agent_steps - self.saved_at >= self.cfg.checkpoint_interval:
-            self.save()
+        row = {"episodes": self.window.total, "episodes_new": episodes} | self.window.summary()
+        row |= times | troubles | learned
+        series: dict[str, float] = {}
+        try:
+            series = self._play_matches()
+        finally:  # a series that fails costs no row
+            self._log_row(row | series)
+        won = bool(series) and self._score() >= self.best_score  # these weights, not those of later on
+        if won or self.agent_steps - self.saved_at >= self.cfg.checkpoint_interval:
+            self.save(won)
 
     def _drop_cut_off(self, batch: TensorDictBase) -> dict[str, float]:
         """Take episodes that failed players cut off out of the batch; count them, and the restarts."""
@@ -228,13 +226,12 @@ class Trainer:
         return self.matches.play(self.agent_steps, self._layout(), actors)
 
     def _score(self) -> float:
-        """What the best checkpoint is chosen by: return_mean, or the win rate where two sides share a policy.
+        """What the best checkpoint is chosen by: return_mean; where there are two sides, the matches.
 
         (There one side's gain is the other's loss, and the mean return says nothing.)
         """
-        if any(len(sides) > 1 for sides in self.env.sides.values()):
-            rate = self.matches.win_rate
-            return rate if math.isfinite(rate) else float(self.agent_steps) * 1e-12
+        if self.matches.two_sided:
+            return self.matches.score(self.agent_steps)
         return self.window.summary()["return_mean"]
 
     def _status(self) -> str | None:
@@ -256,12 +253,15 @@ class Trainer:
 
     # --- checkpoints
 
-    def save(self) -> None:
-        """Write a checkpoint of everything, unless one of this moment is there."""
+    def save(self, best: bool = False) -> None:
+        """Write a checkpoint of everything, unless one of this moment is there.
+
+        `best`: call it the best one though its score is only as good as the best before.
+        """
         if self.last_checkpoint is not None and self.saved_at == self.agent_steps:
             return
         score = self._score()
-        best = score > self.best_score
+        best = best or score > self.best_score
         if best:
             self.best_score = score
         self.saved_at = self.agent_steps

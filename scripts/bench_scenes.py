@@ -28,15 +28,15 @@ from omegaconf import OmegaConf  # noqa: E402
 from mappo_unity.presets import conf_dir  # noqa: E402
 from mappo_unity.scenes import make_scene, scene_names  # noqa: E402
 
-RING = 1009  # actions drawn for each number of agents
+RING = 1009  # actions drawn for each agent
 STEPS_BETWEEN_CLOCKS = 16
 Policy = Callable[[BehaviorSpec, DecisionSteps], ActionTuple]
 
 
 def random_policy() -> Policy:
-    """Return a policy that takes its actions in turn from a ring drawn beforehand."""
+    """Return a policy that takes its actions in turn from a ring, drawn for the most agents seen."""
     rng = np.random.default_rng(0)
-    rings: dict[tuple[ActionSpec, int], Iterator[ActionTuple]] = {}
+    rings: dict[ActionSpec, tuple[int, Iterator[ActionTuple]]] = {}
 
     def draw(spec: ActionSpec, agents: int) -> ActionTuple:
         branches = [rng.integers(0, size, agents) for size in spec.discrete_branches]
@@ -45,10 +45,15 @@ def random_policy() -> Policy:
         return ActionTuple(continuous.astype(np.float32), discrete.astype(np.int32))
 
     def act(spec: BehaviorSpec, decisions: DecisionSteps) -> ActionTuple:
-        key = (spec.action_spec, len(decisions))
-        if key not in rings:
-            rings[key] = itertools.cycle([draw(*key) for _ in range(RING)])
-        return next(rings[key])
+        actions, agents = spec.action_spec, len(decisions)
+        most, ring = rings.get(actions, (0, iter(())))
+        if agents > most:
+            most, ring = agents, itertools.cycle([draw(actions, agents) for _ in range(RING)])
+            rings[actions] = most, ring
+        action = next(ring)
+        if agents == most:
+            return action
+        return ActionTuple(action.continuous[:agents], action.discrete[:agents])
 
     return act
 

@@ -90,9 +90,9 @@ def test_a_pickle_that_would_run_code_is_refused(tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "step_000000000100.pt"
     if kind == "pickle":
-        path.write_bytes(pickle.dumps({"format": 1, "x": Bomb()}))
+        path.write_bytes(pickle.dumps({"format": 2, "x": Bomb()}))
     else:
-        torch.save({"format": 1, "x": Bomb()}, path)
+        torch.save({"format": 2, "x": Bomb()}, path)
         assert zipfile.is_zipfile(path)
     with pytest.raises(CheckpointError, match="damaged or no checkpoint"):
         load(path)
@@ -101,7 +101,7 @@ def test_a_pickle_that_would_run_code_is_refused(tmp_path, monkeypatch, kind):
 
 def test_other_formats_are_refused(tmp_path):
     torch.save({"format": 99}, tmp_path / "a.pt")
-    with pytest.raises(CheckpointError, match="another format"):
+    with pytest.raises(CheckpointError, match="has format 99, but this version reads format 2"):
         load(tmp_path / "a.pt")
 
 

@@ -20,6 +20,7 @@ from mappo_unity.config import (
     Config,
     ConfigError,
     EnvConfig,
+    EnvironmentFailure,
     LogConfig,
     MatchConfig,
     ModelConfig,
@@ -107,8 +108,8 @@ def test_four_iterations_are_two_saved_and_two_more_to_the_bit(tmp_path):
     trainer = Trainer(options(4), tmp_path / "parts")
     real_save = trainer.save
 
-    def save_and_stop():
-        real_save()
+    def save_and_stop(best):
+        real_save(best)
         if trainer.iteration == 2:
             raise KeyboardInterrupt
 
@@ -243,6 +244,51 @@ def test_the_best_checkpoint_of_a_two_sided_run_has_the_weights_that_won_most(tm
     assert won == ["", "0.3", "", "0.8", "0.6"]  # every second iteration, and after the last one
     best = checkpoint.load(tmp_path / "checkpoints" / "best.pt")
     assert best["agent_steps"] == 4 * SOCCER_BATCH
+
+
+@pytest.mark.parametrize(
+    ("played", "best_at"),
+    [
+        ([Score(wins=10), Score(wins=10), Score(wins=10)], 6),  # as good as before: the newer weights
+        ([Score(draws=10), Score(wins=4, losses=6), Score(draws=9, losses=1)], 2),  # a draw is half a win
+        ([Score(losses=10), Score(losses=10), Score(losses=10)], 6),  # worse than none is not better
+    ],
+)
+def test_ties_draws_and_losses_of_series(tmp_path, monkeypatch, played, best_at):
+    scores = iter(played)
+    monkeypatch.setattr(series, "play_matches", lambda *args: {"blue": next(scores)})
+    train(soccer(6), tmp_path)
+    assert checkpoint.load(tmp_path / "checkpoints" / "best.pt")["agent_steps"] == best_at * SOCCER_BATCH
+
+
+def test_sides_of_different_names_are_chosen_by_their_matches_too(tmp_path, monkeypatch):
+    scores = iter([Score(wins=9, losses=1), Score(wins=1, losses=9)])
+    monkeypatch.setattr(series, "play_matches", lambda *args: {"blue": next(scores)})
+    batch = 2 * 3 * ROUNDS
+    env, matches = EnvConfig(name="StrikersVsGoalie", num_areas=2), MatchConfig(interval=batch, count=2)
+    ppo = PPOConfig(minibatch_size=40)
+    train(options(2, env=env, matches=matches, ppo=ppo, max_steps=2 * batch), tmp_path)
+    assert checkpoint.load(tmp_path / "checkpoints" / "best.pt")["agent_steps"] == batch
+
+
+def test_matches_want_two_sides_and_say_so_before_the_first_step(tmp_path):
+    with pytest.raises(ConfigError, match=r"matches.interval=100: .* two sides .* 3DBall has 3DBall\?team=0"):
+        train(options(2, matches=MatchConfig(interval=100)), tmp_path)
+    assert not (tmp_path / "checkpoints").exists()
+
+
+def test_a_series_that_fails_costs_no_row_and_is_played_after_the_resume(tmp_path, monkeypatch):
+    def failing(*args):
+        raise EnvironmentFailure("the player of the matches crashed")
+
+    monkeypatch.setattr(series, "play_matches", failing)
+    with pytest.raises(EnvironmentFailure):
+        train(soccer(5), tmp_path)
+    monkeypatch.setattr(series, "play_matches", lambda *args: {"blue": Score(wins=1)})
+    train(soccer(5), tmp_path, checkpoint.newest_good(tmp_path)[0])
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        rows = [(row["iteration"], row["win_rate_vs_random"]) for row in csv.DictReader(file)]
+    assert rows == [("1", ""), ("2", ""), ("3", "1.0"), ("4", ""), ("5", "1.0")]
 
 
 def test_a_series_at_the_end_leaves_the_rhythm_of_a_longer_run_alone(tmp_path, monkeypatch):

@@ -31,7 +31,8 @@ class Agents:
     Attributes (S slots): `enabled` bool [S]; `agent_id`, `group_id` int32 [S]; `behavior` int64 [S], an
     index into the scene's behaviors; `done` bool [S]: ended since its last decision; `step_count` int64
     [S]: ticks since its episode began; `reward`, `group_reward` float32 [S]: since its last decision;
-    `continuous` float32 [S, C], `discrete` int32 [S, K]: the stored action, zeros after an end.
+    `continuous` float32 [S, C], `discrete` int32 [S, K]: the stored action; zeros after an end, and from
+    an exchange with Python on until it sets another.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class Agents:
         self.clear_actions(slots)
 
     def clear_actions(self, slots: np.ndarray) -> None:
-        """Forget the stored actions: zeros are executed until the next decision."""
+        """Forget the stored actions of `slots` (none twice): zeros are executed until others are stored."""
         if len(slots) == len(self.enabled):
             self.continuous.fill(0)
             self.discrete.fill(0)

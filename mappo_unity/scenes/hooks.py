@@ -66,7 +66,7 @@ class SceneHooks:
         raise NotImplementedError
 
     def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
-        """Return one new array float32 ``[len(slots), *sensor.shape]`` a sensor, without stacking."""
+        """Return a new list: for each sensor a new array float32 ``[len(slots), *shape]``, not stacked."""
         raise NotImplementedError
 
     def observe_all(self, slots: list[np.ndarray]) -> list[list[np.ndarray]]:
