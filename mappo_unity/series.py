@@ -28,7 +28,7 @@ class MatchSeries:
         behaviors: full behavior names of the environment.
 
     Attributes: `two_sided`, whether the environment has two sides; `points`, of the newest series: the share
-    of its matches won, draws counted half; None: none has been played.
+    of its matches won, draws counted half; None: none has been played; `said`, a line about it.
 
     Raises:
         ConfigError: series are wanted, but there are not two sides.
@@ -39,6 +39,7 @@ class MatchSeries:
         self._cfg, self._folder = cfg, folder
         self._played_at = 0
         self.points: float | None = None
+        self.said = ""
         self.two_sided = len({team_id(name) for name in names}) == 2
         if cfg.matches.interval is not None and not self.two_sided:
             raise ConfigError(
@@ -67,6 +68,10 @@ class MatchSeries:
         total = sum(scores.values(), Score())
         matches = max(1, total.matches)
         self.points = (total.wins + 0.5 * total.draws) / matches
+        self.said = (
+            f"{agent_steps:,} steps: of {matches} matches against a random side "
+            f"{total.wins} won, {total.draws} drawn, {total.losses} lost"
+        )
         return {
             "win_rate_vs_random": total.figures()["won_of_decided"],
             "draw_rate_vs_random": total.draws / matches,

@@ -223,7 +223,10 @@ class Trainer:
         if not self.matches.is_due(self.agent_steps):
             return {}
         actors = {name: learner.actor for name, learner in self.learners.items()}
-        return self.matches.play(self.agent_steps, self._layout(), actors)
+        figures = self.matches.play(self.agent_steps, self._layout(), actors)
+        if self.log is not None:
+            self.log.message(self.matches.said)
+        return figures
 
     def _score(self) -> float:
         """What the best checkpoint is chosen by: return_mean; where there are two sides, the matches.
