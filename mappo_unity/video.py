@@ -84,8 +84,33 @@ def check_video(path: Path) -> None:
             ) from error
 
 
+class GifWriter:
+    """Collect frames; Pillow writes them on closing, with a time for each.
+
+    A GIF counts in hundredths of a second: frames end at their time rounded to it, so errors do not add up.
+    """
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self._image: Any = importlib.import_module("PIL.Image")
+        self._path, self._fps = path, fps
+        self._frames: list[Any] = []
+
+    def append_data(self, frame: np.ndarray) -> None:
+        """Append a frame uint8 [height, width, 3]."""
+        self._frames.append(self._image.fromarray(frame))
+
+    def close(self) -> None:
+        """Write the file."""
+        if not self._frames:
+            return
+        ends = [round(100 * number / self._fps) for number in range(len(self._frames) + 1)]
+        durations_ms = [10 * (end - start) for start, end in zip(ends, ends[1:])]
+        first, *rest = self._frames
+        first.save(self._path, save_all=True, append_images=rest, duration=durations_ms, loop=0)
+
+
 def _open_writer(path: Path, fps: float) -> Any:
-    imageio = importlib.import_module("imageio.v2")
     if path.suffix == ".gif":
-        return imageio.get_writer(path, duration=1000 / fps, loop=0)
+        return GifWriter(path, fps)
+    imageio = importlib.import_module("imageio.v2")
     return imageio.get_writer(path, fps=fps, codec="libx264", quality=7, macro_block_size=2)

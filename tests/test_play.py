@@ -72,6 +72,16 @@ def where(frame: np.ndarray, color: Color) -> tuple[float, float, int]:
     return float(columns.mean()), float(rows.mean()), rows.size
 
 
+def gif_durations_ms(path: Path) -> list[int]:
+    """Return how long each frame of a GIF is shown."""
+    with importlib.import_module("PIL.Image").open(path) as image:
+        durations = []
+        for number in range(image.n_frames):
+            image.seek(number)
+            durations.append(image.info["duration"])
+    return durations
+
+
 def test_pictures_show_right_up_and_ahead_as_unity_does(renderer: Renderer) -> None:
     shapes = [ball((2, 0, 0), 0.5, RED), ball((0, 0, 3), 0.5, GREEN), ball((-2, 0, 0), 0.5, BLUE)]
     frame = renderer.frame(shapes, CAMERA)
@@ -116,6 +126,17 @@ def test_videos_hold_every_frame(tmp_path: Path, needs_video: None, suffix: str)
     columns = [where(frame[..., :3], RED)[0] for frame in frames]
     assert np.diff(columns).min() > 5
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(25.0 + 1e-6, 50), (30, 45), (1 / 0.15, 20)])
+def test_a_gif_lasts_as_long_as_its_scene(tmp_path: Path, needs_video: None, fps: float, frames: int) -> None:
+    with VideoFile(tmp_path / "film.gif", CAMERA, SIZE, fps) as film:
+        for step in range(frames):
+            film.write(np.full((8, 8, 3), 5 * step, np.uint8))
+    durations_ms = gif_durations_ms(tmp_path / "film.gif")
+    assert len(durations_ms) == frames
+    assert abs(sum(durations_ms) - 1000 * frames / fps) <= 5
+    assert max(durations_ms) - min(durations_ms) <= 10
 
 
 def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path, needs_video: None) -> None:
