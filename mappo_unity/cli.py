@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -142,8 +143,9 @@ def _train_anew(lines: list[str]) -> int:
     check_factory(composed.config)
     folder = runs.create_folder(composed.run_dir, exact=given(lines, "hydra.run.dir") is not None)
     try:
-        runs.write_record(folder.path, composed.config, lines)
-        return _train(composed.config, folder.path, None)
+        with _locked(folder.path):
+            runs.write_record(folder.path, composed.config, lines)
+            return _train(composed.config, folder.path, None)
     except (ConfigError, KeyboardInterrupt):
         runs.discard_folder(folder)
         raise
@@ -156,9 +158,25 @@ def _train_on(lines: list[str], path: Path) -> int:
     folder = runs.find_run(path, "resume")
     config = compose_resumed(lines, folder / runs.CONFIG)
     check_factory(config)
+    with _locked(folder):
+        return _train_locked(config, folder, path if path.is_file() else folder, lines)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    from mappo_unity.run_lock import locked
+
+    with locked(folder) as warning:
+        if warning is not None:
+            print(f"mappo-train: {warning}", file=sys.stderr)
+        yield
+
+
+def _train_locked(config: Config, folder: Path, source: Path, lines: list[str]) -> int:
+    from mappo_unity import runs
     from mappo_unity.checkpoint import newest_good
 
-    checkpoint, warnings = newest_good(path if path.is_file() else folder)
+    checkpoint, warnings = newest_good(source)
     for warning in warnings:
         print(f"mappo-train: {warning}", file=sys.stderr)
     record = runs.read_record(folder)

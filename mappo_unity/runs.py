@@ -21,9 +21,11 @@ from omegaconf import OmegaConf
 
 from mappo_unity.atomic import write_atomically
 from mappo_unity.config import Config, ConfigError
+from mappo_unity.run_lock import LOCK
 
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
 RECORD = (CONFIG, OVERRIDES, VERSIONS)
+_NO_WORK = (*RECORD, LOCK)  # files of a run that trained nothing
 _PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "numpy", "mlagents-envs", "protobuf", "hydra-core")
 
 
@@ -177,7 +179,7 @@ def _history(path: Path) -> list[Any]:
 
 
 def _other_files(folder: Path) -> dict[Path, tuple[int, int]]:
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in RECORD)
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in _NO_WORK)
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
 
 

@@ -31,6 +31,7 @@ from mappo_unity.compose import Composed, check_factory, compose_config, to_conf
 from mappo_unity.config import Config, ConfigError
 from mappo_unity.overrides import check_overrides, given, open_line, parse, quoted
 from mappo_unity.presets import conf_dir, group_choices
+from mappo_unity.run_lock import locked
 from mappo_unity.runs import NewFolder, create_folder, discard_folder, write_record
 
 RESULT = "result.json"
@@ -137,7 +138,8 @@ def run_job(tree: DictConfig) -> float | None:
     start_s = time.monotonic()
     ended_by: int | None = None
     try:
-        ended_by = _train(to_config(tree), folder, result)
+        with locked(folder):
+            ended_by = _train(to_config(tree), folder, result)
     except KeyboardInterrupt as error:
         result.status = "interrupted"
         ended_by = getattr(error, "signal", int(signal.SIGINT))

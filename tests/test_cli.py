@@ -16,11 +16,12 @@ import pytest
 import yaml
 from fake_training import Outcome
 
-from mappo_unity import __version__
+from mappo_unity import __version__, run_lock
 from mappo_unity.cli import eval_main, train_main
 from mappo_unity.config import Config, ConfigError, EvalConfig
 from mappo_unity.options import option_table
 from mappo_unity.presets import all_groups, describe_choices
+from mappo_unity.run_lock import locked
 from mappo_unity.runs import create_folder, find_run, read_versions
 
 
@@ -248,6 +249,61 @@ def test_a_refused_continuation_changes_nothing(training: FakeTraining) -> None:
     training.writes, training.error = False, ConfigError("another network")
     assert train_main([f"resume={folder}", "model.hidden=[3]"]) == 2
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_run_in_training_takes_no_second_one(
+    training: FakeTraining, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train_main(["hydra.run.dir=mine"])
+    before = {path.name: path.read_bytes() for path in Path("mine").iterdir()}
+    code = (
+        "from pathlib import Path; from mappo_unity.run_lock import locked\n"
+        "with locked(Path('mine')): print('locked', flush=True); input()"
+    )
+    root = str(Path(__file__).resolve().parents[1])
+    other = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": root},
+    )
+    assert other.stdout is not None and other.stdout.readline() == b"locked\n"
+    assert train_main(["resume=mine"]) == 2
+    message = capsys.readouterr().err
+    assert f"mine is being trained by another process (process {other.pid})" in message
+    after = {path.name: path.read_bytes() for path in Path("mine").iterdir()}
+    assert after | {".lock": b""} == before | {".lock": b""} and len(training.calls) == 1
+    other.kill()
+    other.communicate()
+    assert train_main(["resume=mine"]) == 0  # nothing is left of the lock
+
+
+def test_a_run_holds_its_lock_while_it_trains(training: FakeTraining) -> None:
+    seen: list[str] = []
+
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+        with pytest.raises(ConfigError, match="is being trained by another process"), locked(folder):
+            pass
+        seen.append(folder.name)
+        return Outcome()
+
+    sys.modules["mappo_unity.train"].train = train  # type: ignore[attr-defined]
+    assert train_main(["hydra.run.dir=mine"]) == train_main(["resume=mine"]) == 0
+    assert train_main(["-m", "seed=0,1"]) == 0
+    assert seen == ["mine", "mine", "0", "1"]
+    with locked(Path("mine")) as warning:
+        assert warning is None
+
+
+def test_a_place_without_locks_stops_no_run(
+    training: FakeTraining, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(file: Any) -> None:
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr(run_lock, "_lock", refuse)
+    assert train_main([]) == 0
+    assert "cannot be locked (No locks available): take care" in capsys.readouterr().err
 
 
 def test_what_cannot_go_on_is_told(training: FakeTraining, capsys: pytest.CaptureFixture[str]) -> None:
