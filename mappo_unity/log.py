@@ -44,9 +44,9 @@ class RunLog:
 
     `folder` is the run's. With `resume_steps` given (agent decisions at the checkpoint that is continued)
     what the run wrote after that is removed first, from ``metrics.csv``, TensorBoard events and TorchRL's
-    CSV files; W&B and MLflow keep it: W&B continues the same run, MLflow starts another one. Log a row
-    before the checkpoint of its iteration is written, and no row is lost either. `console`: where progress
-    and messages go, standard output by default.
+    CSV files (damaged rows too, with a message and a copy of the file as it was); W&B and MLflow keep it: W&B
+    continues the same run, MLflow starts another one. Log a row before the checkpoint of its iteration is
+    written, and no row is lost either. `console`: where progress and messages go, standard output by default.
 
     Raises ConfigError for a logger that is not installed, and for a new run in a folder that has metrics.
     """
@@ -61,14 +61,15 @@ class RunLog:
     ) -> None:
         check_backends(cfg)
         metrics = folder / "metrics.csv"
+        self._console = console or Console()
         if resume_steps is not None:
-            keep_until(folder, resume_steps)
+            for note in keep_until(folder, resume_steps):
+                self.message(note)
         elif metrics.exists():
             raise ConfigError(
                 f"{metrics} exists already; continue that run (resume={folder}) or take another folder"
             )
         folder.mkdir(parents=True, exist_ok=True)
-        self._console = console or Console()
         self._progress = Progress(self._console, max_steps) if cfg.progress else None
         self._metrics = MetricsFile(metrics)
         self._loggers = [_make_logger(backend, cfg, folder) for backend in dict.fromkeys(cfg.backends)]

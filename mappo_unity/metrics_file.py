@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
+import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -70,33 +72,77 @@ def read_metrics(path: Path) -> list[dict[str, int | float]]:
     ]
 
 
-def keep_until(folder: Path, agent_steps: int) -> None:
+def keep_until(folder: Path, agent_steps: int) -> list[str]:
     """Drop what a run in `folder` wrote after `agent_steps`, and records that a kill cut short.
 
     Concerns ``metrics.csv``, ``tensorboard/`` and ``csv/scalars/``, as far as they exist. Each file is
-    replaced atomically, and left alone where nothing has to go.
+    replaced atomically, and left alone where nothing has to go. Returns a line for each table with damaged
+    rows: they go too, and the file as it was stays beside it.
     """
-    _keep_rows(folder / "metrics.csv", agent_steps)
+    notes = [_keep_rows(folder / "metrics.csv", agent_steps)]
     for path in sorted((folder / "tensorboard").rglob("*tfevents*")):
         _keep_events(path, agent_steps)
     for path in sorted((folder / "csv" / "scalars").rglob("*.csv")):
-        _keep_scalars(path, agent_steps)
+        notes.append(_keep_scalars(path, agent_steps))
+    return [note for note in notes if note is not None]
 
 
-def _keep_rows(path: Path, agent_steps: int) -> None:
-    columns, rows = _read_table(path)
-    if columns:
-        step = columns.index(STEP)
-        rows = [row for row in rows if int(row[step]) <= agent_steps]
-        _rewrite(path, _format([columns, *rows]).encode())
-    elif path.exists():  # a kill within the header
-        _rewrite(path, b"")
+def _keep_rows(path: Path, agent_steps: int) -> str | None:
+    if not path.exists():
+        return None
+    columns, *rows = [_cells(line) for line in _whole_lines(path)] or [[]]
+    kept, damaged = [columns], []
+    for line, row in enumerate(rows, start=2):
+        step = _step_of(row, columns)
+        if step is None:
+            damaged.append(line)
+        elif step <= agent_steps:
+            kept.append(row)
+    if columns and STEP not in columns:  # nobody can say what the rows hold
+        kept, damaged = [[]], [1, *damaged]
+    note = _set_aside(path, damaged)
+    _rewrite(path, _format(kept).encode() if kept[0] else b"")
+    return note
 
 
-def _keep_scalars(path: Path, agent_steps: int) -> None:
+def _keep_scalars(path: Path, agent_steps: int) -> str | None:
     """Trim a file of TorchRL's CSVLogger: lines ``step,value``."""
-    lines = [line for line in path.read_bytes().splitlines(keepends=True) if line.endswith(b"\n")]
-    _rewrite(path, b"".join(line for line in lines if int(line.split(b",")[0]) <= agent_steps))
+    rows = [_cells(line) for line in _whole_lines(path)]
+    steps = [_step_of(row, [STEP, "value"]) for row in rows]
+    note = _set_aside(path, [line for line, step in enumerate(steps, start=1) if step is None])
+    lines = zip(path.read_bytes().split(b"\n"), steps, strict=False)  # without the cut last one
+    kept = [line + b"\n" for line, step in lines if step is not None and step <= agent_steps]
+    _rewrite(path, b"".join(kept))
+    return note
+
+
+def _cells(line: str) -> list[str]:
+    """Return a line's cells; a stray quote swallows no line but its own."""
+    try:
+        return next(csv.reader([line]), [])
+    except csv.Error:
+        return []
+
+
+def _step_of(row: Sequence[str], columns: Sequence[str]) -> int | None:
+    """Return a row's agent steps, None where the row is damaged: cells missing, or no numbers."""
+    try:
+        values = [float(cell) if cell else math.nan for cell in row]
+        return int(values[columns.index(STEP)]) if len(row) == len(columns) else None
+    except (ValueError, OverflowError):
+        return None
+
+
+def _set_aside(path: Path, damaged: Sequence[int]) -> str | None:
+    """Copy a file that has damaged lines beside itself, and say so."""
+    if not damaged:
+        return None
+    names = (f"{path.name}.damaged{number or ''}" for number in itertools.count())
+    copy = next(place for place in (path.with_name(name) for name in names) if not place.exists())
+    write_atomically(copy, path.read_bytes())
+    lines = f"{len(damaged)} damaged line{'s' if len(damaged) > 1 else ''} (line {damaged[0]}"
+    lines += f" to {damaged[-1]})" if len(damaged) > 1 else ")"
+    return f"{path}: {lines} left out; the file as it was: {copy}"
 
 
 def _keep_events(path: Path, agent_steps: int) -> None:
@@ -133,15 +179,18 @@ def _rewrite(path: Path, data: bytes) -> None:
 
 def _read_table(path: Path) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of a file, without a cut last line; both empty where there is none."""
-    text = path.read_bytes().decode("utf-8", errors="replace") if path.exists() else ""
-    whole_lines = text[: text.rfind("\n") + 1]
-    table = list(csv.reader(io.StringIO(whole_lines)))
+    table = list(csv.reader(_whole_lines(path))) if path.exists() else []
     if not table:
         return [], []
     for line, row in enumerate(table[1:], start=2):
         if len(row) != len(table[0]):
             raise ValueError(f"{path}, line {line}: {len(row)} cells, the header has {len(table[0])}")
     return table[0], table[1:]
+
+
+def _whole_lines(path: Path) -> list[str]:
+    """Return a file's lines, without a cut last one."""
+    return [line.decode("utf-8", errors="replace") for line in path.read_bytes().split(b"\n")[:-1]]
 
 
 def _format(rows: Sequence[Sequence[str]]) -> str:

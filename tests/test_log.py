@@ -233,6 +233,45 @@ def test_damaged_event_file_keeps_what_stands_before_the_damage(tmp_path: Path) 
         assert data.startswith(path.read_bytes()[:zeroed])
 
 
+@pytest.mark.parametrize("garbage", ["xxx,,,", "1", 'a"b', "\x00\xff", "", "4,oops,1,2,3", "7,,1,2,3"])
+@pytest.mark.parametrize("at", [2, 4])
+def test_damaged_rows_are_left_out_and_the_file_is_kept(tmp_path: Path, garbage: str, at: int) -> None:
+    path = tmp_path / "metrics.csv"
+    write(tmp_path, range(1, 4), CSV_ONLY)
+    lines = path.read_text().splitlines()
+    lines.insert(at, garbage)
+    damaged = "\n".join([*lines, ""])
+    path.write_text(damaged)
+    console, text = plain_console()
+    write(tmp_path, range(4, 6), CSV_ONLY, resume_steps=300, console=console)
+    assert steps_of(tmp_path) == [100, 200, 300, 400, 500]
+    copy = tmp_path / "metrics.csv.damaged"
+    assert copy.read_text() == damaged
+    assert text.getvalue() == (
+        f"{path}: 1 damaged line (line {at + 1}) left out; the file as it was: {copy}\n"
+    )
+    path.write_text(path.read_text() + "x\nx\n")
+    (note,) = keep_until(tmp_path, 500)
+    assert "2 damaged lines (line 7 to 8)" in note
+    assert sorted(os.listdir(tmp_path)) == ["metrics.csv", "metrics.csv.damaged", "metrics.csv.damaged1"]
+
+
+def test_a_table_without_steps_is_set_aside(tmp_path: Path) -> None:
+    (tmp_path / "metrics.csv").write_text("garbage\n100,1\n")
+    write(tmp_path, range(4, 6), CSV_ONLY, resume_steps=300, console=plain_console()[0])
+    assert steps_of(tmp_path) == [400, 500]
+    assert (tmp_path / "metrics.csv.damaged").read_text() == "garbage\n100,1\n"
+
+
+def test_damaged_scalars_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "csv" / "scalars" / "return_mean.csv"
+    path.parent.mkdir(parents=True)
+    path.write_text("100,1.0\nxxx\n200,2.0\n300,3.0\n40")
+    (note,) = keep_until(tmp_path, 200)
+    assert path.read_text() == "100,1.0\n200,2.0\n" and "line 2" in note
+    assert keep_until(tmp_path, 200) == []
+
+
 def test_killed_writer_loses_no_row(tmp_path: Path) -> None:
     """kill -9 right after `log` returned: the row is in both files, and the next run appends to it."""
     code = f"""
