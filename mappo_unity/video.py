@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import importlib
 import os
-import shutil
-import tempfile
-from collections.abc import Sequence
+import re
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -33,15 +35,16 @@ class VideoFile:
         fps: frames a second.
 
     Raises:
-        ConfigError: the file cannot be written, a package is missing, nothing can be drawn here.
+        ConfigError: the file cannot be written (also later: a full disk), a package is missing, nothing
+            can be drawn here.
     """
 
     def __init__(self, path: Path, camera: Camera, size: tuple[int, int], fps: float) -> None:
         check_video(path)
+        self._path, self._size, self._fps = path, size, fps
+        # Hidden, and no suffix of a film's: nobody may take it for one.
+        self._part = path.with_name(f".{path.stem[:40]}.{os.getpid()}.part")
         self._renderer = Renderer(camera, *size)
-        self._path = path
-        self._folder = Path(tempfile.mkdtemp(prefix=f".{path.stem}_", dir=path.parent))
-        self._writer: Any = _open_writer(self._folder / path.name, fps)
 
     def show(self, shapes: Sequence[Shape], camera: Camera) -> bool:
         """Append a frame; return True: a file always wants more."""
@@ -50,67 +53,124 @@ class VideoFile:
 
     def write(self, frame: np.ndarray) -> None:
         """Append a frame uint8 [height, width, 3]."""
-        self._writer.append_data(frame)
+        with _told(self._path):
+            self._writer.append(frame)
 
     def __enter__(self) -> VideoFile:
+        kind = GifWriter if self._path.suffix == ".gif" else Mp4Writer
+        with ExitStack() as stack:
+            stack.callback(self._renderer.close)
+            with _told(self._path):
+                stack.callback(self._part.unlink, missing_ok=True)
+                self._part.touch()  # what forbids it is told before anything is played
+                self._writer: GifWriter | Mp4Writer = kind(self._part, self._size, self._fps)
+            stack.callback(self._writer.stop)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            self._writer.close()
+        with _told(self._path), self._stack:
             if kind is None:
-                os.replace(self._folder / self._path.name, self._path)
-        finally:
-            shutil.rmtree(self._folder, ignore_errors=True)
-            self._renderer.close()
+                self._writer.finish()
+                os.replace(self._part, self._path)
+
+
+class GifWriter:
+    """Collect frames; write them when the film is over, with a time for each.
+
+    A GIF counts in hundredths of a second: frames end at their time rounded to it, so errors do not add up.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:
+        self._image: Any = importlib.import_module("PIL.Image")
+        self._path, self._fps = path, fps
+        self._frames: list[Any] = []
+
+    def append(self, frame: np.ndarray) -> None:
+        """Append a frame uint8 [height, width, 3]."""
+        self._frames.append(self._image.fromarray(frame))
+
+    def finish(self) -> None:
+        """Write the file; raises OSError."""
+        ends = [round(100 * number / self._fps) for number in range(len(self._frames) + 1)]
+        durations_ms = [10 * (end - start) for start, end in zip(ends, ends[1:])]
+        first, *rest = self._frames
+        with self._path.open("wb") as file:
+            first.save(file, "GIF", save_all=True, append_images=rest, duration=durations_ms, loop=0)
+
+    def stop(self) -> None:
+        """Do nothing: nothing is under way."""
+
+
+class Mp4Writer:
+    """Send frames to ffmpeg.
+
+    Not imageio-ffmpeg's own writer: it passes over ffmpeg's exit code, and a full disk gives a broken film.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:
+        program = importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
+        rate = Fraction(fps).limit_denominator(1001)
+        source = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {rate} -i -"
+        target = "-an -c:v libx264 -pix_fmt yuv420p -crf 15 -f mp4"
+        self._process = subprocess.Popen(
+            [program, "-y", "-v", "error", "-xerror", *source.split(), *target.split(), str(path.absolute())],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is ours to answer
+        )
+
+    def append(self, frame: np.ndarray) -> None:
+        """Append a frame uint8 [height, width, 3]; raises OSError."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(frame.tobytes())
+        except BrokenPipeError:
+            self.finish()
+            raise OSError("ffmpeg ended before the film was complete") from None
+
+    def finish(self) -> None:
+        """Wait until the file is written; raises OSError with ffmpeg's first complaint."""
+        _, complaints = self._process.communicate()
+        if self._process.returncode:
+            first = complaints.decode(errors="replace").strip().split("\n")[0]
+            reason = re.sub(r"^\[[^]]*] *", "", first)  # without the part of ffmpeg that complains
+            raise OSError(reason or f"ffmpeg ended with exit code {self._process.returncode}")
+
+    def stop(self) -> None:
+        """End ffmpeg if it still runs."""
+        self._process.kill()
+        self._process.communicate()
 
 
 def check_video(path: Path) -> None:
     """Raise ConfigError if no video can be written to `path`."""
     if path.suffix not in SUFFIXES:
         raise ConfigError(f"video={path} must end in one of: {', '.join(SUFFIXES)}")
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK) or path.is_dir():
+    with _told(path):
+        writable = path.parent.is_dir() and os.access(path.parent, os.W_OK) and not path.is_dir()
+    if not writable:
         raise ConfigError(
             f"video={path} cannot be written: {path.parent} must be a folder that can be written"
         )
-    for package in ("imageio", "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"):
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise ConfigError(
-                f"video={path} needs the package {package}: pip install 'mappo-unity[video]'"
-            ) from error
+    package = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"
+    try:
+        importlib.import_module(package)
+    except ImportError as error:
+        raise ConfigError(
+            f"video={path} needs the package {package}: pip install 'mappo-unity[video]'"
+        ) from error
 
 
-class GifWriter:
-    """Collect frames; Pillow writes them on closing, with a time for each.
-
-    A GIF counts in hundredths of a second: frames end at their time rounded to it, so errors do not add up.
-    """
-
-    def __init__(self, path: Path, fps: float) -> None:
-        self._image: Any = importlib.import_module("PIL.Image")
-        self._path, self._fps = path, fps
-        self._frames: list[Any] = []
-
-    def append_data(self, frame: np.ndarray) -> None:
-        """Append a frame uint8 [height, width, 3]."""
-        self._frames.append(self._image.fromarray(frame))
-
-    def close(self) -> None:
-        """Write the file."""
-        if not self._frames:
-            return
-        ends = [round(100 * number / self._fps) for number in range(len(self._frames) + 1)]
-        durations_ms = [10 * (end - start) for start, end in zip(ends, ends[1:])]
-        first, *rest = self._frames
-        first.save(self._path, save_all=True, append_images=rest, duration=durations_ms, loop=0)
-
-
-def _open_writer(path: Path, fps: float) -> Any:
-    if path.suffix == ".gif":
-        return GifWriter(path, fps)
-    imageio = importlib.import_module("imageio.v2")
-    return imageio.get_writer(path, fps=fps, codec="libx264", quality=7, macro_block_size=2)
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Tell what kept a film from being written as a mistake in the options."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(
+            f"video={path} cannot be written: {error.strerror or error}; give a file in a folder "
+            "that can be written, on a disk with free space"
+        ) from error

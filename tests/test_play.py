@@ -72,6 +72,17 @@ def where(frame: np.ndarray, color: Color) -> tuple[float, float, int]:
     return float(columns.mean()), float(rows.mean()), rows.size
 
 
+def frames_of(path: Path) -> list[np.ndarray]:
+    """Return the frames of a film."""
+    if path.suffix == ".gif":
+        with importlib.import_module("PIL.Image").open(path) as image:
+            pages = importlib.import_module("PIL.ImageSequence").Iterator(image)
+            return [np.array(page.convert("RGB")) for page in pages]
+    reader = importlib.import_module("imageio_ffmpeg").read_frames(str(path))
+    width, height = next(reader)["size"]
+    return [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]
+
+
 def gif_durations_ms(path: Path) -> list[int]:
     """Return how long each frame of a GIF is shown."""
     with importlib.import_module("PIL.Image").open(path) as image:
@@ -121,9 +132,9 @@ def test_videos_hold_every_frame(tmp_path: Path, needs_video: None, suffix: str)
         for step in range(7):
             assert film.show([ball((step - 3, 0, 0), 0.8, RED)], CAMERA)
             assert not path.exists()
-    frames = importlib.import_module("imageio.v2").mimread(path)
+    frames = frames_of(path)
     assert len(frames) == 7 and frames[0].shape[:2] == (96, 160)
-    columns = [where(frame[..., :3], RED)[0] for frame in frames]
+    columns = [where(frame, RED)[0] for frame in frames]
     assert np.diff(columns).min() > 5
     assert list(tmp_path.iterdir()) == [path]
 
@@ -132,7 +143,7 @@ def test_videos_hold_every_frame(tmp_path: Path, needs_video: None, suffix: str)
 def test_a_gif_lasts_as_long_as_its_scene(tmp_path: Path, needs_video: None, fps: float, frames: int) -> None:
     with VideoFile(tmp_path / "film.gif", CAMERA, SIZE, fps) as film:
         for step in range(frames):
-            film.write(np.full((8, 8, 3), 5 * step, np.uint8))
+            film.write(np.full((96, 160, 3), 5 * step, np.uint8))
     durations_ms = gif_durations_ms(tmp_path / "film.gif")
     assert len(durations_ms) == frames
     assert abs(sum(durations_ms) - 1000 * frames / fps) <= 5
@@ -144,6 +155,48 @@ def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path, needs_video: None
         film.show([ball((0, 0, 0), 0.8, RED)], CAMERA)
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize("suffix", ["mp4", "gif"])
+def test_a_full_disk_is_told_and_leaves_the_film_that_was_there(
+    tmp_path: Path, needs_video: None, suffix: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    video = tmp_path / f"film.{suffix}"
+    video.write_text("an older film")
+    (tmp_path / f".film.{os.getpid()}.part").symlink_to("/dev/full")
+    lines = ["env=Basic", f"video={video}", "seconds=30", "width=96", "height=64"]
+    assert play_main(lines) == 2
+    told = capfd.readouterr().err.strip()
+    assert told.startswith(f"mappo-play: video={video} cannot be written: ") and "\n" not in told
+    assert "No space left on device" in told
+    assert list(tmp_path.iterdir()) == [video] and video.read_text() == "an older film"
+
+
+def test_an_encoder_that_fails_without_a_word_is_told(
+    tmp_path: Path, needs_video: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "ffmpeg").write_text("#!/bin/sh\ncat > /dev/null\nexit 3\n")
+    (tmp_path / "ffmpeg").chmod(0o755)
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(tmp_path / "ffmpeg"))
+    with (
+        pytest.raises(ConfigError, match=r"film.mp4 cannot be written: ffmpeg ended with exit code 3; give"),
+        VideoFile(tmp_path / "film.mp4", CAMERA, SIZE, 10) as film,
+    ):
+        film.show([ball((0, 0, 0), 0.8, RED)], CAMERA)
+    assert [file.name for file in tmp_path.iterdir()] == ["ffmpeg"]
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder that takes no files from anyone")
+def test_a_folder_that_takes_no_files_is_told(
+    needs_video: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("os.access", lambda *_: True)  # as the superuser is told of /proc
+    assert play_main(["env=Basic", "video=/proc/film.gif"]) == 2
+    told = capsys.readouterr().err.strip()
+    assert told.startswith("mappo-play: video=/proc/film.gif cannot be written: ") and "\n" not in told
+    assert play_main(["env=Basic", f"video=/tmp/{300 * 'x'}.gif"]) == 2
+    assert "cannot be written: File name too long; give a file" in capsys.readouterr().err
 
 
 def test_videos_that_cannot_be_written_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,7 +230,7 @@ def test_random_actions_are_filmed(tmp_path: Path, needs_video: None) -> None:
     shown = play(PlayConfig(env="Basic", video=str(video), seconds=6, width=96, height=64))
     assert shown["scene"] == "Basic" and shown["policy"] == "random" and shown["frames"] == 40
     assert shown["episodes"] >= 1 and -1 < shown["mean_return"] <= 0.93
-    assert len(importlib.import_module("imageio.v2").mimread(video)) == 40
+    assert len(frames_of(video)) == 40
 
 
 def test_a_run_is_filmed_from_the_command_line(
