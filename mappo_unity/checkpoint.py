@@ -56,6 +56,11 @@ def save(path: Path, state: dict[str, Any]) -> None:
 
 def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, best: bool) -> Path:
     """Write a run's checkpoint, make it the best one if it is, and drop all but the newest ``keep``."""
+    if not folder.is_dir():
+        raise CheckpointError(
+            f"the run folder {folder} was removed or moved while the run was training: "
+            f"no checkpoint of {agent_steps} steps can be written"
+        )
     path = folder / FOLDER / _NAME.format(agent_steps)
     save(path, state)
     if best:
@@ -123,7 +128,7 @@ def newest_good(where: Path) -> tuple[Path, list[str]]:
     else:
         raise CheckpointError(f"{where} does not exist: give a run folder or a checkpoint file")
     if not candidates:
-        raise CheckpointError(f"{where} holds no checkpoint ({FOLDER}/step_*.pt): nothing to continue from")
+        raise CheckpointError(f"{where} holds no checkpoint ({FOLDER}/step_*.pt)")
     warnings: list[str] = []
     for path in candidates:
         try:

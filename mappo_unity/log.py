@@ -10,8 +10,10 @@ import importlib.util
 import math
 import numbers
 import os
+import threading
 import uuid
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -70,24 +72,46 @@ class RunLog:
                 f"{metrics} exists already; continue that run (resume={folder}) or take another folder"
             )
         folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
         self._progress = Progress(self._console, max_steps) if cfg.progress else None
         self._metrics = MetricsFile(metrics)
+        self._excepthook = threading.excepthook
+        threading.excepthook = self._on_thread_error
         self._loggers = [_make_logger(backend, cfg, folder) for backend in dict.fromkeys(cfg.backends)]
 
     def log(self, row: Mapping[str, Any]) -> None:
         """Record a row: numbers by name, with ``agent_steps``; NaN (no episode yet) goes to the CSV only.
 
         When this returns the row outlives a kill of the process, in ``metrics.csv`` and in the event files.
+        Raises ConfigError where it cannot be written.
         """
         numbers_by_name = {name: _plain(value) for name, value in row.items()}
-        self._metrics.append(numbers_by_name)
-        step = int(numbers_by_name[STEP])
-        curves = {name: x for name, x in numbers_by_name.items() if name != STEP and not math.isnan(x)}
+        try:
+            self._write(numbers_by_name)
+        except OSError as error:
+            raise ConfigError(self._explain(error)) from error
+        if self._progress is not None:
+            self._progress.update(numbers_by_name)
+
+    def _write(self, row: Mapping[str, int | float]) -> None:
+        if not self._folder.is_dir():  # an open file could be written to all the same, and is lost
+            raise FileNotFoundError(self._folder)
+        self._metrics.append(row)
+        step = int(row[STEP])
+        curves = {name: x for name, x in row.items() if name != STEP and not math.isnan(x)}
         for logger in self._loggers:
             logger.log_metrics(curves, step=step)
             logger.flush()
-        if self._progress is not None:
-            self._progress.update(numbers_by_name)
+
+    def _explain(self, error: OSError) -> str:
+        if not self._folder.is_dir():
+            return (
+                f"the run folder {self._folder} was removed or moved while the run was training: it ends here"
+            )
+        return (
+            f"the metrics in {self._folder} cannot be written ({error.strerror or error}); the checkpoints "
+            f"there stay as they are. Free some space, then continue with resume={self._folder}"
+        )
 
     def message(self, text: str) -> None:
         """Print a line above the progress line."""
@@ -98,9 +122,18 @@ class RunLog:
         if self._progress is not None:
             self._progress.close()
             self._progress = None
-        self._metrics.close()
+        with suppress(OSError):  # every row has been flushed; what a full disk refused has been said
+            self._metrics.close()
         while self._loggers:
-            _close_logger(self._loggers.pop())
+            with suppress(OSError):
+                _close_logger(self._loggers.pop())
+        threading.excepthook = self._excepthook
+
+    def _on_thread_error(self, args: threading.ExceptHookArgs) -> None:
+        """Leave out what TensorBoard's writing thread says: its error is raised again by the next flush."""
+        writes = type(args.thread).__module__.startswith("tensorboard.")
+        if not (writes and isinstance(args.exc_value, OSError)):
+            self._excepthook(args)
 
     def __enter__(self) -> RunLog:
         return self

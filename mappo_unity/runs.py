@@ -66,7 +66,7 @@ def discard_folder(folder: NewFolder) -> None:
     """Remove the folder of a run that never began, unless it holds more than the record."""
     if _other_files(folder.path):
         return
-    shutil.rmtree(folder.path)
+    shutil.rmtree(folder.path, ignore_errors=True)  # it may be gone already
     for parent in reversed(folder.made):
         with suppress(OSError):
             parent.rmdir()

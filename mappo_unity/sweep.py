@@ -144,6 +144,7 @@ def run_job(tree: DictConfig) -> float | None:
         result.status = "interrupted"
         ended_by = getattr(error, "signal", int(signal.SIGINT))
     except Exception as error:
+        folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
         result.error = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
         (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
     result.wall_s = round(result.wall_s or time.monotonic() - start_s, 3)

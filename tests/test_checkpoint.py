@@ -80,6 +80,12 @@ def test_missing_folders_and_folders_without_checkpoints(tmp_path):
         newest_good(tmp_path)
 
 
+def test_a_removed_run_folder_is_not_made_again(tmp_path):
+    with pytest.raises(CheckpointError, match="run was removed or moved"):
+        save_in(tmp_path / "run", 100, STATE, keep=5, best=True)
+    assert not (tmp_path / "run").exists()
+
+
 class Bomb:
     def __reduce__(self):
         return os.mkdir, ("boom",)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -196,6 +197,20 @@ def test_what_a_run_has_done_outlives_its_error(training: FakeTraining) -> None:
     training.error = ConfigError("the disk is full")
     assert train_main([]) == 2
     assert (new_run() / "metrics.csv").is_file()
+
+
+def test_a_run_folder_that_is_removed_meanwhile(
+    training: FakeTraining, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+        shutil.rmtree(folder)
+        raise ConfigError("the run folder was removed")
+
+    monkeypatch.setattr(sys.modules["mappo_unity.train"], "train", train)
+    assert train_main([]) == 2
+    assert capsys.readouterr().err == "mappo-train: the run folder was removed\n"
+    assert train_main(["-m", "seed=1,2"]) == 1  # the jobs fail, and the table says so
+    assert capsys.readouterr().err.count("failed: the run folder was removed") == 2
 
 
 def test_a_bug_shows_itself(training: FakeTraining) -> None:

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,40 @@ def test_full_disk_while_columns_are_added_leaves_the_old_file(
         file.append({"agent_steps": 2, "new": 1.0})
     assert (tmp_path / "metrics.csv").read_text() == "agent_steps\n1\n"
     assert os.listdir(tmp_path) == ["metrics.csv"]
+
+
+@pytest.mark.parametrize("cfg", [TENSORBOARD, CSV_ONLY])
+def test_a_removed_folder_is_told_in_one_line(
+    cfg: LogConfig, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with RunLog(cfg, tmp_path / "run", 1000) as log:
+        log.log(row(1))
+        shutil.rmtree(tmp_path / "run")
+        with pytest.raises(ConfigError, match=r"run folder .*run was removed or moved"):
+            log.log(row(2))
+    assert not (tmp_path / "run").exists() and capfd.readouterr().err == ""
+
+
+def test_a_removed_event_folder_is_told_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    hook = threading.excepthook
+    with RunLog(TENSORBOARD, tmp_path, 1000) as log:
+        log.log(row(1))
+        shutil.rmtree(tmp_path / "tensorboard")
+        with pytest.raises(ConfigError, match=r"metrics in .* cannot be written \(No such file"):
+            log.log(row(2))
+    assert threading.excepthook is hook and capfd.readouterr().err == ""
+
+
+def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*arguments: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with RunLog(CSV_ONLY, tmp_path, 1000) as log:
+        log.log(row(1))
+        monkeypatch.setattr(MetricsFile, "append", fail)
+        monkeypatch.setattr(MetricsFile, "close", fail)
+        with pytest.raises(ConfigError, match=r"No space left on device.*continue with resume="):
+            log.log(row(2))
 
 
 def test_damaged_csv_is_named_with_its_line(tmp_path: Path) -> None:
