@@ -136,10 +136,11 @@ def _train_command(lines: list[str]) -> int:
 
 def _train_anew(lines: list[str]) -> int:
     from mappo_unity import runs
-    from mappo_unity.compose import check_factory, compose_config
+    from mappo_unity.compose import check_effect, check_factory, compose_config
     from mappo_unity.overrides import given
 
     composed = compose_config(lines)
+    check_effect(lines, [composed.config])
     check_factory(composed.config)
     folder = runs.create_folder(composed.run_dir, exact=given(lines, "hydra.run.dir") is not None)
     try:

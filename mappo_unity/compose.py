@@ -20,9 +20,10 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from mappo_unity import backend_options
 from mappo_unity.config import Config, ConfigError
 from mappo_unity.options import did_you_mean, option_table
-from mappo_unity.overrides import SWEEP_EXTRA, check_overrides, given, open_line, parse
+from mappo_unity.overrides import SWEEP_EXTRA, check_overrides, given, given_options, open_line, parse
 from mappo_unity.presets import conf_dir, group_choices
 from mappo_unity.runs import CONFIG, find_run
 
@@ -105,7 +106,9 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
             raise ConfigError(
                 f"{key} cannot change with resume: the run goes on in its own folder {base.parent}"
             )
-    return compose_config(rest, base).config
+    config = compose_config(rest, base).config
+    check_effect(rest, [config])
+    return config
 
 
 def load_config(path: Path) -> Config:
@@ -155,6 +158,11 @@ def compose_plain(lines: list[str], schema: type) -> Any:
         return OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
         raise ConfigError(_explain(error)) from error
+
+
+def check_effect(lines: list[str], configs: list[Config]) -> None:
+    """Refuse options on the command line that none of the runs it stands for looks at; raise ConfigError."""
+    backend_options.check_effect(given_options(lines), configs)
 
 
 def check_factory(config: Config) -> None:

@@ -177,9 +177,10 @@ class EnvConfig:
         if (self.screen_width is None) != (self.screen_height is None):
             raise ConfigError("env.screen_width and env.screen_height belong together: give both or neither")
         if self.backend in (Backend.embedded, Backend.custom, Backend.editor) and self.num_players > 1:
+            larger = " (env.num_areas makes it larger)" if self.backend is Backend.embedded else ""
             raise ConfigError(
                 f"env.num_players={self.num_players} needs env.backend=player or registry; with "
-                f"env.backend={self.backend.value} there is one environment (env.num_areas makes it larger)"
+                f"env.backend={self.backend.value} there is one environment{larger}"
             )
         if self.backend in (Backend.player, Backend.editor, Backend.registry):
             for name, value in self.params.items():

@@ -36,6 +36,11 @@ def given(lines: list[str], key: str) -> Any:
     return values[-1] if values else None
 
 
+def given_options(lines: list[str]) -> list[str]:
+    """Return the full names of the options that the overrides set."""
+    return list(dict.fromkeys(item.key_or_group for item in parse(lines) if not item.is_delete()))
+
+
 def parse(lines: list[str]) -> list[Override]:
     """Parse overrides in Hydra's grammar; raise ConfigError for a line that is not one."""
     return [_parse_line(line) for line in lines]

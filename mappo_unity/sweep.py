@@ -27,7 +27,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from mappo_unity.atomic import write_atomically
-from mappo_unity.compose import Composed, check_factory, compose_config, to_config
+from mappo_unity.compose import Composed, check_effect, check_factory, compose_config, to_config
 from mappo_unity.config import Config, ConfigError
 from mappo_unity.overrides import check_overrides, given, open_line, parse, quoted
 from mappo_unity.presets import conf_dir, group_choices
@@ -113,8 +113,11 @@ def plan_jobs(lines: list[str]) -> list[list[str]]:
     else:
         _refuse_intervals(task)
         jobs = [list(job) for job in BasicSweeper.split_arguments(parse(task), None)[0]]
-    for job in jobs:
-        check_factory(_compose_job(job, hydra).config)
+    configs = [_compose_job(job, hydra).config for job in jobs]
+    for config in configs:
+        check_factory(config)
+    if not is_search(lines) or not _sweeps_backend(task):
+        check_effect([line for job in jobs for line in job], configs)
     return jobs
 
 
@@ -216,6 +219,11 @@ def _compose_job(job: list[str], hydra: list[str]) -> Composed:
         return compose_config([*job, *hydra])
     except ConfigError as error:
         raise ConfigError(f"{error} (in the job {' '.join(job) or 'as given'})") from error
+
+
+def _sweeps_backend(lines: list[str]) -> bool:
+    swept = [item for item in parse(lines) if item.is_sweep_override()]
+    return any(item.key_or_group in ("env", "env.backend") for item in swept)
 
 
 def _refuse_intervals(lines: list[str]) -> None:

@@ -111,6 +111,14 @@ def test_a_mistake_is_told_without_torch(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_option_of_another_backend_is_refused(
+    training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train_main(["env=3DBall", "env.file_name=builds/3DBall"]) == 2
+    assert "it needs env.backend=player" in capsys.readouterr().err
+    assert training.calls == [] and list(tmp_path.iterdir()) == []
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert train_main(["--version"]) == 0
     assert capsys.readouterr().out == f"mappo-train {__version__}\n"

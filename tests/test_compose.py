@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 from mappo_unity import compose, presets
-from mappo_unity.compose import check_factory, compose_config, compose_plain, compose_resumed, load_config
+from mappo_unity.compose import (
+    check_effect,
+    check_factory,
+    compose_config,
+    compose_plain,
+    compose_resumed,
+    load_config,
+)
 from mappo_unity.config import Activation, Config, ConfigError, EvalConfig, LogBackend
 from mappo_unity.options import option_table
 from mappo_unity.presets import conf_dir
@@ -146,6 +153,50 @@ def test_a_mistake_is_told(line: str, words: list[str]) -> None:
     for word in words:
         assert word in message
     assert "Traceback" not in message and "full stack trace" not in message
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (
+            ["env.file_name=Game"],
+            ["env.file_name=Game has no effect", "embedded", "needs env.backend=player"],
+        ),
+        ([FACTORY], [f"{FACTORY} has no effect", "needs env.backend=custom"]),
+        (["env.registry_entry=Game"], ["env.registry_entry=Game", "needs env.backend=registry"]),
+        (["env.no_graphics=true"], ["env.no_graphics=true", "needs env.backend=player or registry"]),
+        (["env.time_scale=1"], ["env.time_scale=1.0", "env.backend=player, editor or registry"]),
+        (["env=unity", "env.file_name=Game", "env.port=5005"], ["env.port=5005", "needs env.backend=editor"]),
+        (["env=unity", "env.file_name=Game", "env.backend=editor"], ["env.file_name=Game", "backend=editor"]),
+        (["env=custom", FACTORY, "env.num_areas=3"], ["env.num_areas=3", "custom", "env.params.NAME"]),
+    ],
+)
+def test_an_option_without_effect_is_told(lines: list[str], words: list[str]) -> None:
+    config = compose_config(lines).config
+    with pytest.raises(ConfigError) as caught:
+        check_effect(lines, [config])
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["env.num_areas=3", "env.params.mass=2", "env.max_teams=2", "env.port=null", "ppo.lr=1"],
+        ["env=unity", "env.file_name=Game", "env.no_graphics=true", "env.num_players=2", "env.time_scale=1"],
+        ["env=unity", "env.backend=editor", "env.port=5005", "env.timeout_s=600", "env.quality_level=1"],
+        ["env=unity", "env.backend=registry", "env.registry=a.yaml", "env.registry_entry=Game"],
+        ["env=custom", FACTORY, "env.params.size=3"],
+    ],
+)
+def test_an_option_of_the_chosen_backend_is_taken(lines: list[str]) -> None:
+    check_effect(lines, [compose_config(lines).config])
+
+
+def test_an_option_without_effect_is_refused_when_a_run_goes_on(tmp_path: Path) -> None:
+    write_record(tmp_path, compose_config([]).config, [])
+    with pytest.raises(ConfigError, match="env.file_name=Game has no effect"):
+        compose_resumed([f"resume={tmp_path}", "env.file_name=Game"], tmp_path / CONFIG)
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,7 @@ def test_a_sweep_over_environments_has_one_folder() -> None:
         (["seed=0,1", "ppo.gamma=0.9,7"], ["ppo.gamma=7", "from 0 to 1", "in the job seed=0 ppo.gamma=7"]),
         (["env=3DBall,Nope"], ["env=Nope does not exist"]),
         (["sed=1,2"], ["did you mean seed"]),
+        (["seed=0,1", "env.file_name=Game"], ["env.file_name=Game has no effect", "env.backend=player"]),
         (["ppo.lr=interval(1e-4,1e-3)"], ["interval", "hydra/sweeper=optuna"]),
         (["resume=x", "seed=1,2"], ["resume cannot be swept"]),
         (["hydra/sweeper=optuna", "ppo.lr=interval(a,b)"], ["ppo.lr"]),
