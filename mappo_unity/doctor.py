@@ -180,12 +180,22 @@ def examine_player(report: Report, options: argparse.Namespace) -> None:
 
 
 def _cure_of(player: Any) -> str:
-    if player.handshake is None:
-        return (
-            f"see its log; {CURES['display']}; the build must be for this system, must not wait for a user, "
-            "and needs an agent with Behavior Type Default"
-        )
-    return "see its log" if player.behavior_specs else CURES["no behavior"]
+    if player.handshake is not None and not player.behavior_specs:
+        return CURES["no behavior"]
+    if player.process is None:
+        return f"see Unity's Console, or the Editor's log: {editor_log()}"
+    if player.handshake is not None:
+        return ""  # the finding names the log
+    return (
+        f"{CURES['display']}; the build must be for this system, must not wait for a user, and needs an "
+        "agent with Behavior Type Default"
+    )
+
+
+def editor_log() -> str:
+    """Return where Unity's Editor writes its log on this system (Unity Manual, "Log files reference")."""
+    places = {"darwin": "~/Library/Logs/Unity/Editor.log", "win32": r"%LOCALAPPDATA%\Unity\Editor\Editor.log"}
+    return os.path.expanduser(os.path.expandvars(places.get(sys.platform, "~/.config/unity3d/Editor.log")))
 
 
 def _examine_handshake(report: Report, player: Any) -> None:

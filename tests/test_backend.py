@@ -60,6 +60,14 @@ def options(file_name: str, tmp_path: Path, **more: Any) -> EnvConfig:
     return EnvConfig(backend=Backend.player, file_name=file_name, **(defaults | more))
 
 
+def shell_player(folder: Path, script: str) -> str:
+    """Return a player that is a shell script."""
+    path = folder / "Shell.x86_64"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return str(path)
+
+
 def act_and_step(env: BaseEnv) -> None:
     count = len(env.get_steps(BALL)[0])
     env.set_actions(BALL, ActionTuple(np.zeros((count, 2), np.float32)))
@@ -246,6 +254,39 @@ class TestFailures:
     ) -> None:
         with pytest.raises(ConfigError, match=words):
             make_env_function(options(bad(mode, after), tmp_path, timeout_s=3.0))(0).reset()
+
+    @pytest.mark.parametrize(
+        ("script", "words"),
+        [
+            ("exit 3", "ended while it started: exit code 3; it printed and logged nothing$"),
+            (
+                "echo one; echo two; echo; printf '\\033libfoo.so: not found\\n' >&2; echo four; exit 3",
+                r"it wrote no log, but printed \(.*/Player-0.out\): two \| libfoo.so: not found \| four$",
+            ),
+            ("sleep 100", "did not connect within env.timeout_s=1: .*; it printed and logged nothing$"),
+            (
+                'while [ "$1" != -logFile ]; do shift; done; echo text > "$2"; exit 3',
+                "; its log: .*/Player-0.log$",
+            ),
+        ],
+    )
+    def test_what_it_left_to_read_is_named(self, tmp_path: Path, script: str, words: str) -> None:
+        with pytest.raises(ConfigError, match=words):
+            make_env_function(options(shell_player(tmp_path, script), tmp_path, timeout_s=1.0))(0)
+
+    def test_a_log_that_the_user_chose_is_named(self, tmp_path: Path) -> None:
+        mine = tmp_path / "mine.log"
+        cfg = options(
+            shell_player(tmp_path, f"echo text > {mine}"), tmp_path, player_args=["-logFile", str(mine)]
+        )
+        with pytest.raises(ConfigError, match=f"; its log: {mine}$"):
+            make_env_function(cfg)(0)
+
+    def test_a_file_that_the_system_cannot_execute(self, tmp_path: Path) -> None:
+        game = Path(shell_player(tmp_path, ""))
+        game.write_bytes(b"\x7fELF but not really")
+        with pytest.raises(ConfigError, match=f"printed .*: {game} cannot be executed: Exec format error$"):
+            make_env_function(options(str(game), tmp_path))(0)
 
     def test_behaviors_that_never_appear_are_missed(
         self, bad: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import socket
 import subprocess
@@ -74,6 +75,14 @@ def test_a_sick_player_is_told_its_cure(tmp_path: Path, mode: str, after: int, w
     assert code == 1 and "FAIL" in text and words in text
 
 
+def test_a_player_without_a_log_is_not_said_to_have_one(tmp_path: Path) -> None:
+    game = tmp_path / "Mute.x86_64"
+    game.write_text("#!/bin/sh\nexit 3\n")
+    game.chmod(0o755)
+    code, text = examine("--file-name", str(game))
+    assert code == 1 and "exit code 3; it printed and logged nothing" in text and "its log" not in text
+
+
 def test_files_that_are_no_players(tmp_path: Path) -> None:
     code, text = examine("--file-name", str(tmp_path / "Nothing"))
     assert code == 1 and "no Unity player is there" in text
@@ -99,6 +108,9 @@ def test_the_editor_presses_play(tmp_path: Path) -> None:
 def test_an_editor_that_never_plays() -> None:
     code, text = examine("--editor", "--port", str(free_port()), "--timeout-s", "0.3")
     assert code == 1 and "press Play" in text
+    assert (
+        re.search(r"see Unity's Console, or the Editor's log: /.*Editor\.log", text) and "its log" not in text
+    )
 
 
 def test_ports_in_use_are_told_from_ports_that_linger() -> None:

@@ -3,7 +3,8 @@
 In: `PlayerOptions` and a seed. Out: DecisionSteps and TerminalSteps. Differs from
 mlagents_envs.environment.UnityEnvironment in that it listens on loopback only, takes a port that the system
 gives, decodes without a loop over numbers, refuses numbers that are not finite, and says what failed and
-where the log is. A failure raises `PlayerFailure`, after which the player is gone; `restarts` starts another.
+where the log is, or what a player without one printed. A failure raises `PlayerFailure`, after which the
+player is gone; `restarts` starts another.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ logger = logging.getLogger(__name__)
 
 
 class PlayerFailure(RuntimeError):
-    """A player crashed, hung, left or sent nonsense; the message names its log."""
+    """A player crashed, hung, left or sent nonsense; the message says what it logged or printed."""
 
 
 class ProtocolMismatch(PlayerFailure, ConfigError):
@@ -60,6 +61,12 @@ class PlayerOptions:
     parameters: dict[str, float] = field(default_factory=dict)
     engine: dict[str, Any] = field(default_factory=dict)
     """Arguments of EngineConfigurationChannel.set_configuration_parameters."""
+
+    @property
+    def own_log_file(self) -> Path | None:
+        """The log that `arguments` choose in place of `log_file`."""
+        pairs = zip(self.arguments, self.arguments[1:])
+        return next((Path(path) for name, path in pairs if name.lower() == "-logfile"), None)
 
 
 class UnityPlayer(BaseEnv):
@@ -97,7 +104,8 @@ class UnityPlayer(BaseEnv):
         self._link = Link(options.port)
         if options.executable is not None:
             try:
-                self.process = PlayerProcess(options.executable, self._arguments(), options.log_file)
+                output = options.log_file.with_suffix(".out")
+                self.process = PlayerProcess(options.executable, self._arguments(), output)
             except BaseException:
                 self._link.close()
                 raise
@@ -221,7 +229,7 @@ class UnityPlayer(BaseEnv):
         options = self.options
         arguments = ["-nographics", "-batchmode"] if options.no_graphics else []
         arguments += ["--mlagents-port", str(self._link.port)]
-        if not any(argument.lower() == "-logfile" for argument in options.arguments):
+        if options.own_log_file is None:
             arguments += ["-logFile", str(options.log_file)]
         return arguments + options.arguments
 
@@ -309,15 +317,10 @@ class UnityPlayer(BaseEnv):
     def _log_hint(self) -> str:
         if self.process is None:
             return ""
-        files = [f for f in (self.options.log_file, self.options.log_file.with_suffix(".out")) if _filled(f)]
-        return f"; its log: {files[0] if files else self.options.log_file}"
+        return f"; {self.process.traces(self.options.own_log_file or self.options.log_file)}"
 
 
 MakePlayer = Callable[[int], UnityPlayer]
-
-
-def _filled(path: Path) -> bool:
-    return path.is_file() and path.stat().st_size > 0
 
 
 def _quoted(text: str) -> str:

@@ -24,8 +24,13 @@ import ctypes, os, sys
 ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
 if os.getppid() != int(sys.argv[1]):
     os._exit(1)
-os.execv(sys.argv[2], sys.argv[2:])
+try:
+    os.execv(sys.argv[2], sys.argv[2:])
+except OSError as error:
+    sys.exit(f"{sys.argv[2]} cannot be executed: {error.strerror}")
 """
+LAST_LINES, LAST_BYTES, LINE_LENGTH = 3, 4096, 200
+"""How much of what a failed player printed is quoted: lines, read from the last bytes; characters a line."""
 
 
 def find_executable(file_name: str, option: str = "env.file_name") -> Path:
@@ -51,16 +56,16 @@ def find_executable(file_name: str, option: str = "env.file_name") -> Path:
 class PlayerProcess:
     """A running player, in a session of its own.
 
-    `log_file`: what it prints comes here too, after what it logged before.
+    `output`: the file for what it prints.
     """
 
-    def __init__(self, executable: Path, arguments: list[str], log_file: Path) -> None:
-        self.executable, self.log_file = executable, log_file
+    def __init__(self, executable: Path, arguments: list[str], output: Path) -> None:
+        self.executable, self.output = executable, output
         command = [str(executable), *arguments]
         if sys.platform.startswith("linux"):
             command = [sys.executable, "-S", "-E", "-c", _DIE_WITH_PARENT, str(os.getpid()), *command]
-        log_file.parent.mkdir(parents=True, exist_ok=True)
-        self._process = _starter(os.getpid()).submit(_start, command, log_file.with_suffix(".out")).result()
+        output.parent.mkdir(parents=True, exist_ok=True)
+        self._process = _starter(os.getpid()).submit(_start, command, output).result()
 
     @property
     def pid(self) -> int:
@@ -78,6 +83,15 @@ class PlayerProcess:
             return f"killed by {signal.Signals(-code).name}"
         except ValueError:
             return f"killed by signal {-code}"
+
+    def traces(self, log_file: Path) -> str:
+        """Say what there is to read about this player: its log, else the end of what it printed."""
+        if log_file.is_file() and log_file.stat().st_size > 0:
+            return f"its log: {log_file}"
+        end = _end_of(self.output)
+        return (
+            f"it wrote no log, but printed ({self.output}): {end}" if end else "it printed and logged nothing"
+        )
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for its end; tell whether it came in time."""
@@ -114,6 +128,17 @@ def _start(command: list[str], output: Path) -> subprocess.Popen:
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C is the trainer's business
         )
+
+
+def _end_of(path: Path) -> str:
+    """Return the last lines of a file as one, without control characters; "" if there are none."""
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - LAST_BYTES))
+        text = file.read().decode(errors="replace")
+    lines = ["".join(filter(str.isprintable, line)).strip()[:LINE_LENGTH] for line in text.splitlines()]
+    return " | ".join([line for line in lines if line][-LAST_LINES:])
 
 
 def _beside(path: Path) -> str:
