@@ -128,7 +128,7 @@ def newest_good(where: Path) -> tuple[Path, list[str]]:
     else:
         raise CheckpointError(f"{where} does not exist: give a run folder or a checkpoint file")
     if not candidates:
-        raise CheckpointError(f"{where} holds no checkpoint ({FOLDER}/step_*.pt)")
+        raise CheckpointError(f"{where} holds no checkpoint ({FOLDER}/step_*.pt): nothing to continue from")
     warnings: list[str] = []
     for path in candidates:
         try:

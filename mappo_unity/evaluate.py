@@ -89,12 +89,19 @@ def open_policy(where: str, deterministic: bool, seed: int, option: str = "run")
         return OnnxPolicy(Path(where), deterministic, seed)
     if list(Path(where).glob(f"*{SUFFIX}")) and not list(Path(where).glob("*.pt")):
         return OnnxFolder(Path(where), deterministic, seed)
-    return CheckpointPolicy(choose_checkpoint(Path(where)), deterministic)
+    return CheckpointPolicy(choose_checkpoint(Path(where), option, f"*{SUFFIX}"), deterministic)
 
 
-def choose_checkpoint(run: Path) -> Path:
-    """Return a checkpoint file as it is; of a run folder the best, else the newest good one."""
+def choose_checkpoint(run: Path, option: str = "run", *also: str) -> Path:
+    """Return a checkpoint file as it is; of a run folder the best, else the newest good one.
+
+    Raises:
+        ConfigError: the folder holds none; names the option, and what else was looked for in it (``also``).
+    """
     best = run / checkpoint.FOLDER / checkpoint.BEST
     if run.is_dir() and best.is_file():
         return best
+    if run.is_dir() and not checkpoint.checkpoints_in(run):
+        wanted = (f"{checkpoint.FOLDER}/{checkpoint.BEST}", f"{checkpoint.FOLDER}/step_*.pt", *also)
+        raise ConfigError(f"{option}={run} holds no policy: that folder has none of {', '.join(wanted)}")
     return checkpoint.newest_good(run)[0]

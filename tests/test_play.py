@@ -291,6 +291,11 @@ def test_a_window_shows_frames_at_their_time() -> None:
         (["env=Nope", "video=film.mp4"], "env=Nope does not exist"),
         (["run=nowhere", "video=film.mp4"], "run=nowhere does not exist"),
         (["env=Basic", "policy=none.onnx", "video=film.gif"], "policy=none.onnx does not exist"),
+        (
+            ["env=Basic", "policy=.", "video=film.gif"],
+            "policy=. holds no policy: that folder has none of checkpoints/best.pt, "
+            "checkpoints/step_*.pt, *.onnx\n",
+        ),
         (["env=Basic"], "there is no display"),
     ],
 )
