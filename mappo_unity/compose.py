@@ -23,10 +23,20 @@ from omegaconf.errors import OmegaConfBaseException
 from mappo_unity import backend_options
 from mappo_unity.config import Config, ConfigError
 from mappo_unity.options import did_you_mean, option_table
-from mappo_unity.overrides import SWEEP_EXTRA, check_overrides, given, given_options, open_line, parse
+from mappo_unity.overrides import (
+    SWEEP_EXTRA,
+    check_overrides,
+    check_value,
+    given,
+    given_options,
+    open_line,
+    parse,
+)
 from mappo_unity.presets import conf_dir, group_choices
 from mappo_unity.runs import CONFIG, find_run
 
+_ALWAYS_SAVED = ("env", "output_dir")
+"""The first and the last option of a run's config.yaml: a file that lacks one has been cut off."""
 _NOISE = ("object_type=", "reference_type=", "Config search path", "provider=", "See ", "To append")
 
 
@@ -112,8 +122,13 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
 
 
 def load_config(path: Path) -> Config:
-    """Return the options that a run's config.yaml holds; raise ConfigError."""
-    return compose_config([], path).config
+    """Return the options that a run's config.yaml holds; raise ConfigError, which names the file."""
+    try:
+        return compose_config([], path).config
+    except ConfigError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def config_to_play(run: Path, env: str | None) -> Config:
@@ -201,15 +216,28 @@ def _is_own_function(value: Any, module: str) -> bool:
 
 
 def _resumed_root(base: Path) -> dict[Any, Any]:
-    try:
-        saved = OmegaConf.to_container(OmegaConf.load(base))
-    except Exception as error:
-        raise ConfigError(f"{base} cannot be read ({error})") from error
-    if not isinstance(saved, dict):
-        raise ConfigError(f"{base} holds no options")
+    saved = _read_options(base)
     groups = [{group: None} for group in group_choices() if group != "env"]
     quiet = [{"override hydra/job_logging": "none"}, {"override hydra/hydra_logging": "none"}]
     return {"defaults": ["schema", "_self_", *groups, *quiet], **saved}
+
+
+def _read_options(path: Path) -> dict[Any, Any]:
+    try:
+        saved = OmegaConf.to_container(OmegaConf.load(path))
+    except Exception as error:
+        raise ConfigError(f"{path} cannot be read ({' '.join(str(error).split())})") from error
+    if not isinstance(saved, dict) or not saved:
+        raise ConfigError(f"{path} holds no options")
+    missing = [key for key in _ALWAYS_SAVED if key not in saved]
+    if missing:
+        raise ConfigError(f"{path} is not complete: {' and '.join(missing)} missing")
+    for key, value in saved.items():
+        try:
+            check_value(str(key), value, Config)
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from error
+    return saved
 
 
 def _explain(error: BaseException) -> str:

@@ -77,6 +77,22 @@ def check_overrides(
         _check_option(override, line, schema, groups)
 
 
+def check_value(key: str, value: Any, schema: type) -> None:
+    """Check the name and the type of an option's value, or of all in a section; raise ConfigError."""
+    table = option_table(schema)
+    option = find_option(table, key)
+    if option is None:
+        raise ConfigError(_unknown(key, table, {}))
+    if option.is_section:
+        if not isinstance(value, dict):
+            inside = ", ".join(_inside(key, table))
+            raise ConfigError(f"{key}={show_value(value)}: {key} is a section; its options: {inside}")
+        for name, item in value.items():
+            check_value(f"{key}.{name}", item, schema)
+    elif not (isinstance(value, str) and "${" in value):
+        _check_type(key, value, option, schema)
+
+
 def quoted(value: str | Path) -> str:
     """Return a text as a quoted value of Hydra's grammar."""
     text = str(value).replace("\\", "\\\\").replace("'", "\\'")
@@ -141,22 +157,7 @@ def _check_option(override: Override, line: str, schema: type, groups: dict[str,
             raise ConfigError(f"{line}: {key} cannot be deleted, only set: {key}=value")
         return
     for value in _values(override):
-        _check_value(key, value, schema)
-
-
-def _check_value(key: str, value: Any, schema: type) -> None:
-    table = option_table(schema)
-    option = find_option(table, key)
-    if option is None:
-        raise ConfigError(_unknown(key, table, {}))
-    if option.is_section:
-        if not isinstance(value, dict):
-            inside = ", ".join(_inside(key, table))
-            raise ConfigError(f"{key}={show_value(value)}: {key} is a section; its options: {inside}")
-        for name, item in value.items():
-            _check_value(f"{key}.{name}", item, schema)
-    elif not (isinstance(value, str) and "${" in value):
-        _check_type(key, value, option, schema)
+        check_value(key, value, schema)
 
 
 def _check_type(key: str, value: Any, option: Option, schema: type) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -265,11 +265,34 @@ def test_a_mistake_in_going_on_is_told(line: str, words: list[str], tmp_path: Pa
         assert word in str(caught.value)
 
 
-def test_a_broken_config_file_of_a_run_is_told(tmp_path: Path) -> None:
-    for text in ("a: [", "- 1", "seed: x", "nonsense: 1"):
-        (tmp_path / CONFIG).write_text(text)
-        with pytest.raises(ConfigError, match=r"config\.yaml|seed|nonsense"):
-            load_config(tmp_path / CONFIG)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: "", ["holds no options"]),
+        (lambda text: "# nothing", ["holds no options"]),
+        (lambda text: "- 1", ["holds no options"]),
+        (lambda text: "a: [", ["cannot be read"]),
+        (lambda text: text[: len(text) // 2].rpartition("\n")[0], ["is not complete: output_dir missing"]),
+        (lambda text: text.replace("seed: 0", "seed: x"), ["seed=x does not fit", "a whole number"]),
+        (lambda text: text.replace("seed: 0", "seed: -1"), ["seed=-1 is out of range"]),
+        (lambda text: text.replace("gamma: 0.99", "gamma: [1]"), ["ppo.gamma=[1]", "must be a number"]),
+        (lambda text: text.replace("seed: 0", "sed: 0"), ["sed is not an option (did you mean seed?)"]),
+        (lambda text: text + "1: 2", ["1 is not an option"]),
+    ],
+)
+def test_a_broken_config_file_of_a_run_is_told(
+    change: Callable[[str], str], words: list[str], tmp_path: Path
+) -> None:
+    write_record(tmp_path, compose_config([]).config, [])
+    path = tmp_path / CONFIG
+    path.write_text(change(path.read_text()))
+    for read in (load_config, lambda file: compose_resumed([f"resume={tmp_path}", "seed=3"], file)):
+        with pytest.raises(ConfigError) as caught:
+            read(path)
+        message = str(caught.value)
+        assert message.startswith(str(path)) and "\n" not in message
+        for word in words:
+            assert word in message
 
 
 def test_evaluation_options() -> None:
