@@ -7,9 +7,10 @@ In: `EnvConfig`. Out: a function ``seed -> BaseEnv``. The only module that knows
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +166,21 @@ def _custom(cfg: EnvConfig) -> MakeEnv:
         return env
 
     return make
+
+
+def check_call(factory: Callable[..., Any], name: str, params: Mapping[str, Any]) -> None:
+    """Raise ConfigError if a factory does not take these parameters, as far as its signature says."""
+    try:
+        signature = inspect.signature(factory)
+    except (TypeError, ValueError):
+        return  # a builtin without one
+    try:
+        signature.bind(seed=0, **params)
+    except TypeError as error:
+        raise ConfigError(
+            f"{name} cannot be called with seed and {', '.join(params) or 'nothing else'}: {error}; it is "
+            f"{getattr(factory, '__name__', 'function')}{signature}"
+        ) from error
 
 
 def load_factory(path: str) -> Callable[..., Any]:

@@ -84,13 +84,14 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
     """Return the function (seed, number of areas or None) -> BaseEnv of a scene or a factory.
 
     `num_areas` and `params` given here win over what the trainer says.
-    Raises ConfigError: there is no such scene.
+    Raises ConfigError: there is no such scene, or it does not take them.
     """
     fixed: dict[str, Any] = dict(params or {}) | ({} if num_areas is None else {"num_areas": num_areas})
     if ":" in scene:
-        from mappo_unity.backend import load_factory
+        from mappo_unity.backend import check_call, load_factory
 
         factory = load_factory(scene)
+        check_call(factory, scene, fixed)
         return lambda seed, areas: factory(seed=seed, **fixed)
     from mappo_unity.scenes import make_scene, scene_names
 
@@ -98,6 +99,7 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
         raise ConfigError(
             f"there is no scene {scene!r}; choices: {', '.join(scene_names())}, or package.module:function"
         )
+    make_scene(scene, **{"num_areas": 1} | fixed).close()  # refuses what it does not take
     return lambda seed, areas: make_scene(
         scene, seed=seed, **({} if areas is None else {"num_areas": areas}) | fixed
     )
@@ -253,7 +255,7 @@ def _parameter(text: str) -> tuple[str, float]:
         number = np.nan
     if not name or not np.isfinite(number):
         raise ConfigError(f"--param {text} is not of the form NAME=NUMBER")
-    return name, number
+    return name, int(number) if number.is_integer() else number  # num_threads and others want whole ones
 
 
 class _Parser(argparse.ArgumentParser):

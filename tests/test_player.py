@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fakes import vector_spec
 
+from mappo_unity.cli import player_main
 from mappo_unity.config import ConfigError
 from mappo_unity.link import decode, encode, messages
 from mappo_unity.link.rows import varint_columns
@@ -331,6 +332,11 @@ def random_action(spec: BehaviorSpec, count: int, rng: np.random.Generator) -> A
     return action
 
 
+def a_factory(seed: int, size: int = 1) -> Any:
+    """Stand for a user's factory."""
+    return make_scene("3DBall", seed=seed, num_areas=size)
+
+
 class TestCommand:
     """Options of mappo-player."""
 
@@ -356,6 +362,38 @@ class TestCommand:
     def test_mistakes_are_named(self, arguments: list[str], words: str) -> None:
         with pytest.raises(ConfigError, match=words.replace("(", r"\(")):
             main(arguments)
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (
+                ["3DBall", "--param", "foo=1"],
+                "scene 3DBall has no parameter 'foo'; choices: gravity, mass, scale",
+            ),
+            (
+                ["3DBall", "--param", "mass=-1"],
+                "parameter mass=-1 of scene 3DBall is out of range: it must be > 0",
+            ),
+            (["3DBall", "--param", "num_areas=0"], "num_areas=0 must be a whole number >= 1"),
+            (["3DBall", "--param", "num_threads=1.5"], "num_threads=1.5 must be a whole number >= 1"),
+            (
+                ["test_player:a_factory", "--param", "foo=1"],
+                "unexpected keyword argument 'foo'; it is a_factory(seed",
+            ),
+        ],
+    )
+    def test_options_are_checked_before_the_trainer_is_called(
+        self, arguments: list[str], words: str, monkeypatch: pytest.MonkeyPatch, capsys: Any
+    ) -> None:
+        monkeypatch.setattr("mappo_unity.player.serve", lambda *_: pytest.fail("it called the trainer"))
+        assert player_main(arguments) == 2
+        printed = capsys.readouterr().err
+        assert words in printed and printed.count("\n") == 1
+
+    def test_whole_numbers_stay_whole(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("mappo_unity.player.serve", lambda *_: 0)
+        assert main(["3DBall", "--param", "num_threads=2", "--param", "mass=2.5"]) == 0
+        assert main(["test_player:a_factory", "--param", "size=3"]) == 0
 
     def test_a_folder_that_cannot_be_written_is_named(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
