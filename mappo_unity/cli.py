@@ -147,8 +147,8 @@ def _train_anew(lines: list[str]) -> int:
         with _locked(folder.path):
             runs.write_record(folder.path, composed.config, lines)
             return _train(composed.config, folder.path, None)
-    except (ConfigError, KeyboardInterrupt):
-        runs.discard_folder(folder)
+    except (ConfigError, KeyboardInterrupt) as error:
+        runs.discard_folder(folder, error)
         raise
 
 

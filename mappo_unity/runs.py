@@ -25,6 +25,7 @@ from mappo_unity.run_lock import LOCK
 
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
 RECORD = (CONFIG, OVERRIDES, VERSIONS)
+PLAYERS = "players"  # the folder of their logs
 _NO_WORK = (*RECORD, LOCK)  # files of a run that trained nothing
 _PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "numpy", "mlagents-envs", "protobuf", "hydra-core")
 
@@ -62,9 +63,13 @@ def create_folder(wanted: Path, exact: bool = False) -> NewFolder:
     return folder
 
 
-def discard_folder(folder: NewFolder) -> None:
-    """Remove the folder of a run that never began, unless it holds more than the record."""
-    if _other_files(folder.path):
+def discard_folder(folder: NewFolder, reason: BaseException | None = None) -> None:
+    """Remove the folder of a run that never began, unless it holds more than the record.
+
+    Players' logs are no more, unless `reason`, which the user is told, names one.
+    """
+    named = (folder.path / PLAYERS).is_dir() and str(folder.path / PLAYERS) in str(reason)
+    if named or _other_files(folder.path):
         return
     shutil.rmtree(folder.path, ignore_errors=True)  # it may be gone already
     for parent in reversed(folder.made):
@@ -179,7 +184,8 @@ def _history(path: Path) -> list[Any]:
 
 
 def _other_files(folder: Path) -> dict[Path, tuple[int, int]]:
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in _NO_WORK)
+    found = (path for path in folder.rglob("*") if path.is_file() and path.name not in _NO_WORK)
+    files = (path for path in found if path.relative_to(folder).parts[0] != PLAYERS)
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
 
 

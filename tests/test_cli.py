@@ -201,6 +201,33 @@ def test_a_mistake_that_the_training_finds_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("named", [False, True])
+def test_players_that_came_up_in_vain_leave_nothing(training: FakeTraining, named: bool) -> None:
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+        log = folder / "players" / "Player-0.log"
+        log.parent.mkdir()
+        log.write_text("a player's words")
+        raise ConfigError(f"its log: {log}" if named else "matches need two sides")
+
+    sys.modules["mappo_unity.train"].train = train  # type: ignore[attr-defined]
+    assert train_main(["hydra.run.dir=mine"]) == 2
+    assert Path("mine").exists() == named
+
+
+def test_a_refused_continuation_with_players_keeps_its_options(training: FakeTraining) -> None:
+    train_main(["hydra.run.dir=mine"])
+    before = Path("mine/config.yaml").read_text()
+
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+        (folder / "players").mkdir()
+        (folder / "players" / "Player-0.log").write_text("a player's words")
+        raise ConfigError("another network")
+
+    sys.modules["mappo_unity.train"].train = train  # type: ignore[attr-defined]
+    assert train_main(["resume=mine", "model.hidden=[3]"]) == 2
+    assert Path("mine/config.yaml").read_text() == before
+
+
 def test_what_a_run_has_done_outlives_its_error(training: FakeTraining) -> None:
     training.error = ConfigError("the disk is full")
     assert train_main([]) == 2
