@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mappo_unity.config import Config, ConfigError, EnvironmentFailure, EvalConfig, ExportConfig, PlayConfig
+from mappo_unity.interrupts import interrupts_wait
 
 _SIGNALS = {2: "SIGINT", 15: "SIGTERM"}
 
@@ -67,14 +68,14 @@ def _run_command(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except ConfigError as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(f"{name}: {error}", *error.details, sep="\n", file=sys.stderr)
         return 2
     except EnvironmentFailure as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 3
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print(f"{name}: interrupted", file=sys.stderr)
-        return 130
+        return 128 + int(getattr(error, "signal", 2))
 
 
 def _train_help() -> str:
@@ -108,7 +109,8 @@ def _player_help() -> str:
 
 
 def _player_command(lines: list[str]) -> int:
-    from mappo_unity.player import main
+    with interrupts_wait():
+        from mappo_unity.player import main
 
     return main(lines)
 
@@ -120,7 +122,8 @@ def _doctor_help() -> str:
 
 
 def _doctor_command(lines: list[str]) -> int:
-    from mappo_unity.doctor import diagnose
+    with interrupts_wait():
+        from mappo_unity.doctor import diagnose
 
     return diagnose(lines, print)
 
@@ -135,13 +138,14 @@ def _train_command(lines: list[str]) -> int:
 
 
 def _train_anew(lines: list[str]) -> int:
-    from mappo_unity import runs
-    from mappo_unity.compose import check_effect, check_factory, compose_config
-    from mappo_unity.overrides import given
+    with interrupts_wait():
+        from mappo_unity import runs
+        from mappo_unity.compose import check_effect, check_factory, compose_config
+        from mappo_unity.overrides import given
 
-    composed = compose_config(lines)
-    check_effect(lines, [composed.config])
-    check_factory(composed.config)
+        composed = compose_config(lines)
+        check_effect(lines, [composed.config])
+        check_factory(composed.config)
     folder = runs.create_folder(composed.run_dir, exact=given(lines, "hydra.run.dir") is not None)
     try:
         with _locked(folder.path):
@@ -153,12 +157,13 @@ def _train_anew(lines: list[str]) -> int:
 
 
 def _train_on(lines: list[str], path: Path) -> int:
-    from mappo_unity import runs
-    from mappo_unity.compose import check_factory, compose_resumed
+    with interrupts_wait():
+        from mappo_unity import runs
+        from mappo_unity.compose import check_factory, compose_resumed
 
-    folder = runs.find_run(path, "resume")
-    config = compose_resumed(lines, folder / runs.CONFIG)
-    check_factory(config)
+        folder = runs.find_run(path, "resume")
+        config = compose_resumed(lines, folder / runs.CONFIG)
+        check_factory(config)
     with _locked(folder):
         return _train_locked(config, folder, path if path.is_file() else folder, lines)
 
@@ -190,10 +195,12 @@ def _train_locked(config: Config, folder: Path, source: Path, lines: list[str]) 
 
 
 def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
-    from mappo_unity.train import train
+    with interrupts_wait():
+        from mappo_unity.train import train
 
     print(f"continuing from {checkpoint}" if checkpoint else f"run folder: {folder}", flush=True)
     outcome = train(config, folder, checkpoint)
+    from mappo_unity.overrides import shell_argument
     from mappo_unity.report import run_summary
 
     print("\n".join(run_summary(outcome, folder)), flush=True)
@@ -202,7 +209,7 @@ def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
     name = _SIGNALS.get(outcome.signal, f"signal {outcome.signal}")
     print(
         f"mappo-train: ended by {name}; checkpoint {outcome.last_checkpoint}; "
-        f"continue with: mappo-train resume={folder}",
+        f"continue with: mappo-train {shell_argument('resume', folder)}",
         file=sys.stderr,
     )
     return 128 + outcome.signal
@@ -226,12 +233,13 @@ def _sweep(lines: list[str]) -> int:
 
 
 def _eval_command(lines: list[str]) -> int:
-    from mappo_unity.compose import check_factory, compose_plain, config_to_play
+    with interrupts_wait():
+        from mappo_unity.compose import check_factory, compose_plain, config_to_play
 
-    options = vars(compose_plain(lines, EvalConfig))
-    run = Path(options.pop("run"))
-    check_factory(config_to_play(run, options["env"]))
-    from mappo_unity.evaluate import evaluate
+        options = vars(compose_plain(lines, EvalConfig))
+        run = Path(options.pop("run"))
+        check_factory(config_to_play(run, options["env"]))
+        from mappo_unity.evaluate import evaluate
 
     result: dict[str, Any] = evaluate(run, **options)
     from mappo_unity import report
@@ -242,12 +250,13 @@ def _eval_command(lines: list[str]) -> int:
 
 
 def _play_command(lines: list[str]) -> int:
-    from mappo_unity.compose import check_factory, compose_plain, config_to_play
+    with interrupts_wait():
+        from mappo_unity.compose import check_factory, compose_plain, config_to_play
 
-    options = compose_plain(lines, PlayConfig)
-    check_factory(config_to_play(Path(options.run or ""), options.env))
-    from mappo_unity.play import play
-    from mappo_unity.report import play_line
+        options = compose_plain(lines, PlayConfig)
+        check_factory(config_to_play(Path(options.run or ""), options.env))
+        from mappo_unity.play import play
+        from mappo_unity.report import play_line
 
     print(play_line(play(options)))
     return 0
@@ -260,8 +269,9 @@ def _export_command(lines: list[str]) -> int:
     options = compose_plain(lines, ExportConfig)
     run = Path(options.run)
     find_run(run, "run")
-    from mappo_unity.evaluate import choose_checkpoint
-    from mappo_unity.export import export_checkpoint
+    with interrupts_wait():
+        from mappo_unity.evaluate import choose_checkpoint
+        from mappo_unity.export import export_checkpoint
 
     checkpoint = choose_checkpoint(run)
     for file in export_checkpoint(checkpoint, Path(options.out) if options.out else None):

@@ -7,7 +7,10 @@ that names the option, its value, the rule and the choices. Composes nothing.
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
+import shlex
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -66,7 +69,8 @@ def check_overrides(
         key = override.key_or_group
         if override.is_sweep_override() and not sweep:
             raise ConfigError(
-                f"{line}: several values for {key} make a sweep, which needs -m (mappo-train -m {line})"
+                f"{line}: several values for {key} make a sweep, which needs -m "
+                f"(mappo-train -m {shell_word(line)})"
             )
         if key.startswith(("hydra.", "hydra/")) and groups:
             _check_sweep_extra(line)
@@ -95,8 +99,26 @@ def check_value(key: str, value: Any, schema: type) -> None:
 
 def quoted(value: str | Path) -> str:
     """Return a text as a quoted value of Hydra's grammar."""
-    text = str(value).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
+    text = str(value)
+    mark = "'" if '"' in text and "'" not in text else '"'
+    # backslashes count only before a quote, the closing one too
+    text = re.sub(rf"(\\+)(?={mark}|$)", r"\1\1", text).replace(mark, "\\" + mark)
+    return mark + text + mark
+
+
+def shell_argument(key: str, value: str | Path) -> str:
+    """Return ``key=value`` as it is typed into a shell: quoted for Hydra and for the shell, where needed."""
+    line = f"{key}={value}"
+    try:
+        is_plain = OverridesParser.create().parse_override(line).value() == str(value)
+    except HydraException:
+        is_plain = False
+    return shell_word(line if is_plain else f"{key}={quoted(value)}")
+
+
+def shell_word(text: str | Path) -> str:
+    """Return a text as one word of the system's shell."""
+    return subprocess.list2cmdline([str(text)]) if os.name == "nt" else shlex.quote(str(text))
 
 
 def _parse_line(line: str) -> Override:

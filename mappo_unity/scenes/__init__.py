@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from mappo_unity.config import ConfigError
+from mappo_unity.interrupts import interrupts_wait
 
 if TYPE_CHECKING:
     from mlagents_envs.base_env import BaseEnv
@@ -42,5 +43,7 @@ def make_scene(name: str, seed: int = 0, **params: Any) -> BaseEnv:
     """
     if name not in SCENES:
         raise ConfigError(f"there is no embedded scene {name!r}; choices: {', '.join(SCENES)}")
-    module, _, scene = SCENES[name].partition(":")
-    return getattr(importlib.import_module(f"{__name__}.{module}"), scene)(seed=seed, **params)
+    module_name, _, scene = SCENES[name].partition(":")
+    with interrupts_wait():
+        module = importlib.import_module(f"{__name__}.{module_name}")
+    return getattr(module, scene)(seed=seed, **params)
