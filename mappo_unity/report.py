@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from mappo_unity.overrides import shell_argument, shell_word
 from mappo_unity.sweep import JobResult, SweepResult, job_options, varied_options
 
 if TYPE_CHECKING:
@@ -42,9 +43,9 @@ def run_summary(outcome: Outcome, folder: Path) -> list[str]:
         lines.append(f"best checkpoint: {best}")
     return [
         *lines,
-        f"evaluate:    mappo-eval run={folder}",
-        f"continue:    mappo-train resume={folder}",
-        f"curves:      tensorboard --logdir {folder}",
+        f"evaluate:    mappo-eval {shell_argument('run', folder)}",
+        f"continue:    mappo-train {shell_argument('resume', folder)}",
+        f"curves:      tensorboard --logdir {shell_word(folder)}",
     ]
 
 

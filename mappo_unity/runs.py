@@ -21,6 +21,7 @@ from omegaconf import OmegaConf
 
 from mappo_unity.atomic import write_atomically
 from mappo_unity.config import Config, ConfigError
+from mappo_unity.overrides import shell_argument
 from mappo_unity.run_lock import LOCK
 
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
@@ -160,7 +161,7 @@ def _claim(wanted: Path, exact: bool) -> Path:
         if any(wanted.iterdir()):
             raise ConfigError(
                 f"the folder {wanted} is not empty, and nothing is overwritten: "
-                f"name another one, or continue the run in it with resume={wanted}"
+                f"name another one, or continue the run in it with {shell_argument('resume', wanted)}"
             )
         return wanted
     for count in range(10_000):

@@ -468,9 +468,9 @@ class TestOptions:
             ConfigError, match="no Unity player is there; looked for .*Gaem with .x86_64.*3DBall"
         ):
             make_env_function(options(str(Path(build).with_name("Gaem")), tmp_path))
-        plain = tmp_path / "Game.x86_64"
+        plain = tmp_path / "My Game.x86_64"
         plain.write_text("")
-        with pytest.raises(ConfigError, match="is not executable; run: chmod"):
+        with pytest.raises(ConfigError, match="is not executable; run: chmod .x '/.*My Game.x86_64'"):
             make_env_function(options(str(plain), tmp_path))
 
     @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -290,6 +291,18 @@ def test_a_run_goes_on_in_its_folder(training: FakeTraining, capsys: pytest.Capt
     ]
     saved = yaml.safe_load((folder / "config.yaml").read_text())
     assert saved["max_steps"] == 20 and saved["resume"] is None
+
+
+@pytest.mark.parametrize("name", ["sp ace", "a=b,c (d)", "o'clock"])
+def test_printed_commands_can_be_pasted(
+    name: str, training: FakeTraining, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train_main([f'output_dir="{name}"']) == 0
+    (folder,) = (Path(name) / "3DBall").iterdir()
+    (hint,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("continue:"))
+    command, *lines = shlex.split(hint.partition(":")[2])
+    assert command == "mappo-train" and train_main(lines) == 0
+    assert training.calls[1][1] == folder
 
 
 def test_a_refused_continuation_changes_nothing(training: FakeTraining) -> None:

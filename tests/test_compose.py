@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ from mappo_unity.compose import (
 )
 from mappo_unity.config import Activation, Config, ConfigError, EvalConfig, LogBackend
 from mappo_unity.options import option_table
+from mappo_unity.overrides import given, shell_argument
 from mappo_unity.presets import conf_dir
 from mappo_unity.runs import CONFIG, write_record
 
@@ -293,6 +295,27 @@ def test_a_broken_config_file_of_a_run_is_told(
         assert message.startswith(str(path)) and "\n" not in message
         for word in words:
             assert word in message
+
+
+@pytest.mark.parametrize(
+    ("path", "argument"),
+    [
+        ("outputs/3DBall/2026-11-20_12-00-00", "resume=outputs/3DBall/2026-11-20_12-00-00"),
+        ("sp ace/run", "'resume=sp ace/run'"),
+        ("a=b,c (d)", """'resume="a=b,c (d)"'"""),
+        ("007", "resume=007"),
+        ("12", """'resume="12"'"""),
+        *(
+            (path, None)
+            for path in ("null", "a'b", 'a"b', "a\\'b\"", "x[1]", "~/ä#$", r"C:\Users\x", "e\\", "[")
+        ),
+    ],
+)
+def test_an_argument_for_the_shell_names_the_same_path(path: str, argument: str | None) -> None:
+    shown = shell_argument("resume", path)
+    assert argument in (None, shown)
+    (line,) = shlex.split(shown)
+    assert given([line], "resume") == path
 
 
 def test_evaluation_options() -> None:

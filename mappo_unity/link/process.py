@@ -18,6 +18,7 @@ from functools import cache
 from pathlib import Path
 
 from mappo_unity.config import ConfigError
+from mappo_unity.overrides import shell_word
 
 _DIE_WITH_PARENT = """
 import ctypes, os, sys
@@ -49,7 +50,9 @@ def find_executable(file_name: str, option: str = "env.file_name") -> Path:
             f"{kinds}; give the path of the built player{_beside(Path(file_name))}"
         )
     if not os.access(found, os.X_OK):
-        raise ConfigError(f"{option}={file_name}: {found} is not executable; run: chmod +x {found}")
+        raise ConfigError(
+            f"{option}={file_name}: {found} is not executable; run: chmod +x {shell_word(found)}"
+        )
     return Path(found).absolute()
 
 
