@@ -20,6 +20,7 @@ from mappo_unity.policies import Policy
 from mappo_unity.scenes.base import Scene
 from mappo_unity.scenes.drawings import drawing_of
 from mappo_unity.scenes.drawings.shapes import Camera, Drawing, Shape
+from mappo_unity.termination import termination_as_interrupt
 from mappo_unity.video import VideoFile, check_video
 from mappo_unity.window import Window
 
@@ -43,6 +44,7 @@ def play(cfg: PlayConfig) -> dict[str, Any]:
 
     Raises:
         ConfigError: no scene of ours, no policy that fits it, no way to draw or to write the file.
+        Interrupted: SIGTERM came; like after Ctrl-C, nothing of the film is left.
     """
     video = Path(cfg.video) if cfg.video else None
     if video is not None:
@@ -56,7 +58,7 @@ def play(cfg: PlayConfig) -> dict[str, Any]:
         pace = Pace(drawing, cfg.seconds)
         first, size = _camera(drawing, scene), (cfg.width, cfg.height)
         if video is not None:
-            with VideoFile(video, first, size, pace.fps) as file:
+            with termination_as_interrupt(), VideoFile(video, first, size, pace.fps) as file:
                 figures = _roll(scene, policy, Projector(scene, drawing, pace, file))
         else:
             with Window(first, size, pace.fps, f"mappo-play {scene.NAME}") as window:

@@ -12,11 +12,8 @@ import math
 import signal
 import time
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
@@ -27,24 +24,18 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from mappo_unity.atomic import write_atomically
+from mappo_unity.behavior_lines import dotted_options
 from mappo_unity.compose import Composed, check_effect, check_factory, compose_config, to_config
 from mappo_unity.config import Config, ConfigError
 from mappo_unity.overrides import check_overrides, given, open_line, parse, quoted
 from mappo_unity.presets import conf_dir, group_choices
 from mappo_unity.run_lock import locked
 from mappo_unity.runs import NewFolder, create_folder, discard_folder, write_record
+from mappo_unity.termination import Interrupted, termination_as_interrupt
 
 RESULT = "result.json"
 GOOD = ("finished", "solved")
 _SEVERAL = "several"  # stands for env.name in the sweep's folder where the jobs differ in it
-
-
-class Interrupted(KeyboardInterrupt):
-    """A signal ended a job, and with it the sweep."""
-
-    def __init__(self, number: int = signal.SIGINT) -> None:
-        super().__init__(number)
-        self.signal = int(number)
 
 
 @dataclass
@@ -83,7 +74,7 @@ def run_sweep(lines: list[str]) -> SweepResult:
     folder = _sweep_folder(lines, planned)
     result = SweepResult(folder.path)
     try:
-        with _termination_as_interrupt():
+        with termination_as_interrupt():
             _launch([*_without(lines, "hydra.sweep.dir"), f"hydra.sweep.dir={quoted(folder.path)}"])
     except KeyboardInterrupt as error:
         result.signal = getattr(error, "signal", int(signal.SIGINT))
@@ -168,8 +159,11 @@ def varied_options(jobs: list[JobResult]) -> list[str]:
 
 def job_options(job: JobResult) -> dict[str, str]:
     """Return a job's overrides by option name."""
-    pairs = (line.partition("=") for line in job.overrides)
-    return {key: value for key, _, value in pairs}
+    options: dict[str, str] = {}
+    for line in job.overrides:
+        options |= dotted_options(line)
+    return options
+
 
 
 def _train(config: Config, folder: Path, result: JobResult) -> int | None:
@@ -268,17 +262,3 @@ def _is_hydra(line: str) -> bool:
 
 def _without(lines: list[str], key: str) -> list[str]:
     return [line for line in lines if parse([line])[0].key_or_group != key]
-
-
-@contextmanager
-def _termination_as_interrupt() -> Iterator[None]:
-    """Between jobs, let SIGTERM end a sweep as Ctrl-C does: with its table and its exit code."""
-
-    def interrupt(number: int, frame: Any) -> None:
-        raise Interrupted(number)
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import time
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,35 @@ def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path, needs_video: None
         film.show([ball((0, 0, 0), 0.8, RED)], CAMERA)
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "gif"])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_ends_a_film_and_leaves_nothing(
+    tmp_path: Path,
+    needs_video: None,
+    suffix: str,
+    number: signal.Signals,
+    code: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    write = VideoFile.write
+
+    def write_and_end(film: VideoFile, frame: np.ndarray) -> None:
+        write(film, frame)
+        assert [file.suffix for file in tmp_path.iterdir()] == [".part"]
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(VideoFile, "write", write_and_end)
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        lines = ["env=Basic", f"video={tmp_path / 'film'}.{suffix}", "seconds=3", "width=96", "height=64"]
+        assert play_main(lines) == code
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert not list(tmp_path.iterdir()) and capsys.readouterr().err == "mappo-play: interrupted\n"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
