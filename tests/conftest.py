@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,3 +26,22 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip(f"needs the shared folder (MAPPO_SHARED={folder} is not a folder)")
     return folder
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Iterator[Any]:
+    """Return a renderer; skip where no OpenGL works."""
+    films = importlib.import_module("films")
+    try:
+        made = importlib.import_module("mappo_unity.render").Renderer(films.CAMERA, *films.SIZE)
+    except importlib.import_module("mappo_unity.config").ConfigError as error:
+        pytest.skip(str(error))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def needs_video(renderer: Any) -> None:
+    """Skip where no video can be written."""
+    pytest.importorskip("imageio_ffmpeg")
+    pytest.importorskip("PIL")
