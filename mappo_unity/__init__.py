@@ -1,7 +1,7 @@
 """Train multi-agent policies (MAPPO) on Unity ML-Agents environments.
 
 Set before torch is imported, unless the environment says otherwise: threads of OpenMP that wait for each
-other sleep instead of spinning. Where a core is shared, two spinning ones learn several times slower than one.
+other sleep instead of spinning. Where a core is shared, two that spin learn several times slower than one.
 """
 
 import os

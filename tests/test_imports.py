@@ -1,9 +1,12 @@
 """The package's import graph has no cycle, and light modules stay light."""
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 import mappo_unity
 
@@ -44,3 +47,11 @@ def test_options_and_help_need_no_torch():
     light = "mappo_unity.compose, mappo_unity.cli, mappo_unity.help"
     code = f"import sys, {light}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.parametrize(("given", "found"), [({}, "PASSIVE 0"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE 0")])
+def test_waiting_threads_sleep_unless_the_environment_says_otherwise(given, found):
+    code = "import os, mappo_unity; print(os.environ['OMP_WAIT_POLICY'], os.environ['GOMP_SPINCOUNT'])"
+    clean = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+    run = subprocess.run([sys.executable, "-c", code], env=clean | given, capture_output=True, text=True)
+    assert run.stdout.strip() == found
