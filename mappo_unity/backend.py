@@ -12,9 +12,10 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from traceback import TracebackException
 from typing import Any
 
-from mappo_unity.config import Backend, ConfigError, EnvConfig
+from mappo_unity.config import Backend, ConfigError, EnvConfig, EnvironmentFailure
 from mappo_unity.protobuf import install
 
 install()
@@ -27,6 +28,8 @@ EDITOR_PORT = 5004
 """Port on which Unity's Editor looks for a trainer."""
 PLAYER_STRIDE = 100_003
 """Player n of several starts from the seed plus n times this (modulo 2^31)."""
+OUR_FRAMES = ("<frozen importlib", str(Path(inspect.getfile(importlib)).parent), str(Path(__file__).parent))
+"""Beginnings of file names in a traceback that say nothing about a user's code."""
 
 
 def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv:
@@ -148,24 +151,31 @@ def _describe(cfg: EnvConfig) -> str:
 
 
 def _custom(cfg: EnvConfig) -> MakeEnv:
-    factory = load_factory(str(cfg.factory))
+    name = f"env.factory={cfg.factory}"
+    factory = load_factory(str(cfg.factory), name)
+    return lambda seed: call_factory(factory, name, seed, cfg.params)
 
-    def make(seed: int) -> BaseEnv:
-        try:
-            env = factory(seed=seed, **cfg.params)
-        except TypeError as error:
-            raise ConfigError(
-                f"env.factory={cfg.factory} could not be called as function(seed={seed}, **env.params) with "
-                f"env.params={dict(cfg.params)}: {error}"
-            ) from error
-        if not isinstance(env, BaseEnv):
-            raise ConfigError(
-                f"env.factory={cfg.factory} returned a {type(env).__name__}; it must return a "
-                "mlagents_envs.base_env.BaseEnv"
-            )
-        return env
 
-    return make
+def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapping[str, Any]) -> BaseEnv:
+    """Return a user's environment.
+
+    Raises:
+        ConfigError: the factory does not take the parameters, raised something (its `details` are the user's
+            frames of the traceback), or returned no BaseEnv. ConfigError and EnvironmentFailure of its own
+            pass.
+    """
+    check_call(factory, name, params)
+    try:
+        env = factory(seed=seed, **params)
+    except (ConfigError, EnvironmentFailure):
+        raise
+    except Exception as error:
+        raise _raised(error, name) from error
+    if not isinstance(env, BaseEnv):
+        raise ConfigError(
+            f"{name} returned a {type(env).__name__}; it must return a mlagents_envs.base_env.BaseEnv"
+        )
+    return env
 
 
 def check_call(factory: Callable[..., Any], name: str, params: Mapping[str, Any]) -> None:
@@ -183,21 +193,34 @@ def check_call(factory: Callable[..., Any], name: str, params: Mapping[str, Any]
         ) from error
 
 
-def load_factory(path: str) -> Callable[..., Any]:
-    """Return the function that package.module:function names; raises ConfigError."""
+def load_factory(path: str, name: str) -> Callable[..., Any]:
+    """Return the function that package.module:function names; raises ConfigError, which calls it `name`."""
     module_name, _, function_name = path.partition(":")
     if str(Path.cwd()) not in sys.path:  # as `python -m` does: modules beside the user count
         sys.path.insert(0, str(Path.cwd()))
     try:
         module = importlib.import_module(module_name)
-    except ImportError as error:
-        raise ConfigError(
-            f"env.factory={path}: module {module_name!r} cannot be imported: {error}"
-        ) from error
+    except Exception as error:  # the user's module raises what it likes
+        raise _raised(error, f"{name}: module {module_name!r} cannot be imported: it") from error
     function = getattr(module, function_name, None)
     if not callable(function):
         names = sorted(n for n, v in vars(module).items() if callable(v) and not n.startswith("_"))
         raise ConfigError(
-            f"env.factory={path}: {module_name} has no function {function_name!r}; it has {names}"
+            f"{name}: {module_name} has no function {function_name!r}; it has {', '.join(names) or 'none'}"
         )
     return function
+
+
+def _raised(error: Exception, who: str) -> ConfigError:
+    """Return the mistake "`who` raised ..." with the traceback of the user's code, without our frames."""
+    text = str(error).strip()
+    mistake = ConfigError(
+        f"{who} raised {type(error).__name__}" + (f": {' '.join(text.split())}" if text else "")
+    )
+    report = TracebackException.from_exception(error)
+    part: TracebackException | None = report
+    while part is not None:
+        part.stack[:] = [frame for frame in part.stack if not frame.filename.startswith(OUR_FRAMES)]
+        part = part.__cause__ or part.__context__
+    mistake.details = tuple("".join(report.format()).splitlines())
+    return mistake

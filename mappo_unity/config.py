@@ -15,7 +15,12 @@ from typing import Any, Optional
 
 
 class ConfigError(ValueError):
-    """A mistake in the options; the message names the option, its value and the rule."""
+    """A mistake in the options; the message names the option, its value and the rule.
+
+    `details`: lines to print below it, such as a traceback of the user's code.
+    """
+
+    details: tuple[str, ...] = ()
 
 
 class EnvironmentFailure(RuntimeError):

@@ -44,7 +44,7 @@ class PlayerError(RuntimeError):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run mappo-player; return the exit code: 0 when the trainer closed, 1 after an error, 2 for options.
+    """Run mappo-player; return the exit code: 0 when the trainer closed, 1 after an error, 2 for a mistake.
 
     Raises:
         ConfigError: a mistake in the options.
@@ -88,11 +88,11 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
     """
     fixed: dict[str, Any] = dict(params or {}) | ({} if num_areas is None else {"num_areas": num_areas})
     if ":" in scene:
-        from mappo_unity.backend import check_call, load_factory
+        from mappo_unity.backend import call_factory, check_call, load_factory
 
-        factory = load_factory(scene)
+        factory = load_factory(scene, scene)
         check_call(factory, scene, fixed)
-        return lambda seed, areas: factory(seed=seed, **fixed)
+        return lambda seed, areas: call_factory(factory, scene, seed, fixed)
     from mappo_unity.scenes import make_scene, scene_names
 
     if scene not in scene_names():
@@ -113,7 +113,14 @@ def serve(player: Player, port: int, log: Log) -> int:
     except grpc.FutureTimeoutError:
         log(f"no trainer listens on port {port} of this machine")
         return 1
-    exchange = channel.unary_unary(messages.METHOD)
+    try:
+        return play(player, channel.unary_unary(messages.METHOD), log)
+    finally:
+        channel.close()
+
+
+def play(player: Player, exchange: Callable[..., bytes], log: Log) -> int:
+    """Play until the trainer closes, and log how that ended; return the exit code."""
     try:
         player.play(exchange)
         log("the trainer closed")
@@ -121,12 +128,14 @@ def serve(player: Player, port: int, log: Log) -> int:
     except grpc.RpcError as error:
         log(f"the connection to the trainer is gone: {error.code()}")
         return 1
+    except ConfigError as mistake:
+        log("\n".join([str(mistake), *mistake.details]))
+        _say_goodbye(exchange, str(mistake))
+        return 2
     except Exception as error:
         log(traceback.format_exc())
         _say_goodbye(exchange, f"{type(error).__name__}: {error}")
         return 1
-    finally:
-        channel.close()
 
 
 @dataclass
@@ -284,5 +293,5 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except ConfigError as mistake:
-        print(f"mappo-player: {mistake}", file=sys.stderr)
+        print(f"mappo-player: {mistake}", *mistake.details, sep="\n", file=sys.stderr)
         sys.exit(2)

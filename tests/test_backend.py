@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from mappo_unity.backend import PLAYER_STRIDE, make_env_function
+from mappo_unity.cli import train_main
 from mappo_unity.config import Backend, ConfigError, EnvConfig, EnvironmentFailure
 from mappo_unity.link.restarts import SEED_STRIDE, RestartingPlayer
 from mappo_unity.link.server import Link
@@ -389,13 +390,8 @@ class TestSeveral:
 class TestEditor:
     """The Editor presses Play: here mappo-player does."""
 
-    def free_port(self) -> int:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            return int(probe.getsockname()[1])
-
     def test_it_connects_and_says_what_it_waits_for(self, build: str, caplog: Any) -> None:
-        port = self.free_port()
+        port = free_port()
         play = subprocess.Popen([f"{build}.x86_64", "--mlagents-port", str(port)], stdout=subprocess.DEVNULL)
         try:
             with caplog.at_level(logging.WARNING):
@@ -409,7 +405,7 @@ class TestEditor:
             play.kill()
 
     def test_an_editor_that_never_comes(self) -> None:
-        port = self.free_port()
+        port = free_port()
         with pytest.raises(
             ConfigError, match=f"did not connect to port {port} within env.timeout_s=0.5: press"
         ):
@@ -458,6 +454,85 @@ class TestRegistry:
             make_env_function(EnvConfig(registry_entry="Broken", **cfg))  # type: ignore[arg-type]
         with pytest.raises(ConfigError, match="cannot be read"):
             make_env_function(EnvConfig(backend=Backend.registry, registry=str(tmp_path / "no.yaml")))
+
+
+class Simulator:
+    """What a user's factory might make: it fails, inside code of ours and out of another error."""
+
+    def __init__(self, seed: int, size: int) -> None:
+        try:
+            make_scene("3DBall", seed=seed, num_areas=2).set_actions(BALL, None)  # type: ignore[arg-type]
+        except AttributeError as error:
+            raise ValueError(f"size {size}\n is bad") from error
+
+
+class TestCustom:
+    """A factory of the user's, which may do anything."""
+
+    def test_what_it_raised_and_where(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        factory = "env.factory=test_backend:Simulator"
+        assert train_main(["env=custom", factory, "env.params.size=3"]) == 2
+        first, *details = capsys.readouterr().err.splitlines()
+        assert first == f"mappo-train: {factory} raised ValueError: size 3 is bad"
+        frames = [line for line in details if line.startswith("  File")]
+        assert sum(__file__ in line for line in frames) == 2
+        assert not any("/mappo_unity/" in line for line in frames)
+        assert sum(line.startswith("Traceback") for line in details) == 2
+        assert any(line.startswith("AttributeError") for line in details)
+
+    @pytest.mark.parametrize(
+        ("factory", "words"),
+        [
+            ("test_backend:free_port", r"cannot be called with seed and size: .*'seed'; it is free_port\(\)"),
+            (
+                "test_backend:options",
+                "cannot be called with seed and size: missing a required argument: 'file_name'",
+            ),
+            ("builtins:dict", "returned a dict; it must return a mlagents_envs.base_env.BaseEnv"),
+            ("test_backend:refuse", "^size=3 is odd$"),
+            (
+                "broken_by_hand:make",
+                "module 'broken_by_hand' cannot be imported: it raised ZeroDivisionError: ",
+            ),
+            (
+                "absent_module:make",
+                "module 'absent_module' cannot be imported: it raised ModuleNotFoundError: ",
+            ),
+        ],
+    )
+    def test_other_ways_to_fail(
+        self, factory: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "broken_by_hand.py").write_text("1 / 0\n")
+        monkeypatch.syspath_prepend(tmp_path)
+        with pytest.raises(ConfigError, match=words) as caught:
+            make_env_function(EnvConfig(backend=Backend.custom, factory=factory, params={"size": 3}))(0)
+        assert "\n" not in str(caught.value)
+        if factory.startswith("broken"):
+            assert [line for line in caught.value.details if "File" in line] == [
+                f'  File "{tmp_path}/broken_by_hand.py", line 1, in <module>'
+            ]
+
+    def test_a_failure_of_its_own_passes(self) -> None:
+        cfg = EnvConfig(backend=Backend.custom, factory="test_backend:refuse", params={"size": 2})
+        with pytest.raises(EnvironmentFailure, match="^the simulator is gone$"):
+            make_env_function(cfg)(0)
+
+
+def refuse(seed: int, size: int) -> None:
+    """Stand for a factory that knows our errors."""
+    if size % 2:
+        raise ConfigError(f"size={size} is odd")
+    raise EnvironmentFailure("the simulator is gone")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 class TestOptions:

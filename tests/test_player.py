@@ -16,7 +16,7 @@ from mappo_unity.cli import player_main
 from mappo_unity.config import ConfigError
 from mappo_unity.link import decode, encode, messages
 from mappo_unity.link.rows import varint_columns
-from mappo_unity.player import env_function, main
+from mappo_unity.player import Player, env_function, main, play
 from mappo_unity.scenes import make_scene, scene_names
 
 from mlagents_envs.base_env import (  # isort: skip  # mappo_unity lets it import
@@ -285,8 +285,6 @@ class TestOtherClients:
 @pytest.mark.parametrize("scene", scene_names())
 def test_every_scene_passes_through_the_wire_unchanged(scene: str) -> None:
     """The player's bytes, decoded, are the embedded scene's steps, to the bit; actions come back as sent."""
-    from mappo_unity.player import Player
-
     areas = 1 if scene in ("SoccerTwos", "GridFoodCollector", "Pyramids") else None
     mine = make_scene(scene, seed=5, **({"num_areas": areas} if areas else {}))
     player = Player(env_function(scene, areas), scene)
@@ -334,6 +332,8 @@ def random_action(spec: BehaviorSpec, count: int, rng: np.random.Generator) -> A
 
 def a_factory(seed: int, size: int = 1) -> Any:
     """Stand for a user's factory."""
+    if size > 8:
+        raise RuntimeError("too big")
     return make_scene("3DBall", seed=seed, num_areas=size)
 
 
@@ -389,6 +389,28 @@ class TestCommand:
         assert player_main(arguments) == 2
         printed = capsys.readouterr().err
         assert words in printed and printed.count("\n") == 1
+
+    def test_a_factory_that_raises_is_told_to_the_trainer(self) -> None:
+        make_env = env_function("test_player:a_factory", params={"size": 9})
+        with pytest.raises(ConfigError, match="^test_player:a_factory raised RuntimeError: too big$"):
+            make_env(0, None)
+
+        class Channel:
+            def __init__(self) -> None:
+                self.sent: list[bytes] = []
+
+            def __call__(self, data: bytes, timeout: float = 0) -> bytes:
+                self.sent.append(data)
+                start = decode.initialization(5, 1, "0.28.0")
+                return messages.message(200, unity_input=start)
+
+        lines: list[str] = []
+        channel = Channel()
+        assert play(Player(make_env, "a_factory", lines.append), channel, lines.append) == 2
+        goodbye = messages.parse(channel.sent[-1]).header
+        assert goodbye.message == "test_player:a_factory raised RuntimeError: too big"
+        assert goodbye.status == messages.STATUS_QUIT
+        assert "in a_factory" in lines[-1] and "player.py" not in lines[-1].replace(__file__, "")
 
     def test_whole_numbers_stay_whole(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("mappo_unity.player.serve", lambda *_: 0)
