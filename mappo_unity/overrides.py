@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import IntervalSweep, Override
+from hydra.core.override_parser.types import IntervalSweep, Override, Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mappo_unity.behavior_lines import readable_line
 from mappo_unity.config import Config, ConfigError
 from mappo_unity.options import Option, did_you_mean, find_option, option_table, show_value
 
@@ -51,6 +52,7 @@ def parse(lines: list[str]) -> list[Override]:
 
 def open_line(line: str) -> str:
     """Let new names below an open option do without Hydra's plus signs: ``env.params.mass=2``."""
+    line = readable_line(line)
     match = _LINE.fullmatch(line)
     option = find_option(option_table(Config), match["key"]) if match else None
     is_new = match is not None and match["prefix"] is None and option is not None and option.is_open
@@ -100,10 +102,8 @@ def check_value(key: str, value: Any, schema: type) -> None:
 def quoted(value: str | Path) -> str:
     """Return a text as a quoted value of Hydra's grammar."""
     text = str(value)
-    mark = "'" if '"' in text and "'" not in text else '"'
-    # backslashes count only before a quote, the closing one too
-    text = re.sub(rf"(\\+)(?={mark}|$)", r"\1\1", text).replace(mark, "\\" + mark)
-    return mark + text + mark
+    mark = Quote.single if '"' in text and "'" not in text else Quote.double
+    return str(QuotedString(text, mark).with_quotes())
 
 
 def shell_argument(key: str, value: str | Path) -> str:
@@ -127,19 +127,25 @@ def _parse_line(line: str) -> Override:
             f"{line} is not an option: settings are written option=value (seed=1), "
             "and the only switches are -m, --help and --version"
         )
-    match = _LINE.fullmatch(line)
-    if match is None:
-        raise ConfigError(f"{line!r} is not of the form option=value (for example seed=1)")
-    if match["rest"] is None and match["prefix"] != "~":
-        raise ConfigError(f"{line} has no value: write {match['key']}=value")
+    key = line.partition("=")[0].lstrip("+~")
     try:
-        return OverridesParser.create().parse_override(line)
+        text = readable_line(line)
+        _check_form(text, line)
+        return OverridesParser.create().parse_override(text)
     except HydraException as error:
         reason = str(error).splitlines()[0]
         raise ConfigError(
             f"{line} cannot be read ({reason}): a list is written [1,2], and a text with spaces or any of "
-            f"=,:()[]{{}} stands in quotes inside quotes, {match['key']}='\"like, this\"'"
+            f"=,:()[]{{}} stands in quotes inside quotes, {key}='\"like, this\"'"
         ) from error
+
+
+def _check_form(text: str, line: str) -> None:
+    match = _LINE.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"{line!r} is not of the form option=value (for example seed=1)")
+    if match["rest"] is None and match["prefix"] != "~":
+        raise ConfigError(f"{line} has no value: write {match['key']}=value")
 
 
 def _check_sweep_extra(line: str) -> None:

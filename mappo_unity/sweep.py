@@ -24,7 +24,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from mappo_unity.atomic import write_atomically
-from mappo_unity.behavior_lines import dotted_options
+from mappo_unity.behavior_lines import dotted_options, readable_lines
 from mappo_unity.compose import Composed, check_effect, check_factory, compose_config, to_config
 from mappo_unity.config import Config, ConfigError
 from mappo_unity.overrides import check_overrides, given, open_line, parse, quoted
@@ -96,7 +96,7 @@ def plan_jobs(lines: list[str]) -> list[list[str]]:
     check_overrides(lines, Config, group_choices(), sweep=True)
     if given(lines, "resume") is not None:
         raise ConfigError("resume cannot be swept: continue one run at a time, without -m")
-    task = [line for line in lines if not _is_hydra(line)]
+    task = readable_lines([line for line in lines if not _is_hydra(line)])
     hydra = [line for line in lines if _is_hydra(line)]
     if is_search(lines):
         fixed = [line for line in task if not parse([line])[0].is_sweep_override()]
@@ -195,7 +195,7 @@ def _launch(lines: list[str]) -> None:
     search_path = create_config_search_path(str(conf_dir()))
     hydra = Hydra.create_main_hydra2("mappo-train", search_path)
     try:
-        hydra.multirun("config", run_job, [open_line(line) for line in lines])
+        hydra.multirun("config", run_job, [open_line(line) for line in readable_lines(lines)])
     finally:
         GlobalHydra.instance().clear()
 

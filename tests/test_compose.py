@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from mappo_unity import compose, presets
+from mappo_unity.behavior_options import options_of
 from mappo_unity.compose import (
     check_effect,
     check_factory,
@@ -101,6 +102,28 @@ def test_env_params_take_new_names_without_a_plus() -> None:
     assert config.env.params == {"mass": 2, "wind": {"x": 1, "y": [0.5]}, "z": "a"}
 
 
+def test_behaviors_may_have_any_name() -> None:
+    config = compose_config(
+        [
+            "behaviors.3DBall.ppo.lr=1e-4",
+            "behaviors.3DBall.ppo.gamma=0.9",
+            "behaviors.3DBall.model.hidden=[8,4]",
+            "++behaviors.3DBall.ppo.lr=2e-4",
+            "behaviors.3D-Ball.ppo={lr: 3e-4}",
+            "behaviors.My Ball.ppo.optimizer='adamw'",
+            "behaviors.Goalie.ppo.lr=0.1",
+        ]
+    ).config
+    assert config.behaviors == {
+        "3DBall": {"ppo": {"lr": 2e-4, "gamma": 0.9}, "model": {"hidden": [8, 4]}},
+        "3D-Ball": {"ppo": {"lr": 3e-4}},
+        "My Ball": {"ppo": {"optimizer": "adamw"}},
+        "Goalie": {"ppo": {"lr": 0.1}},
+    }
+    model, ppo = options_of(config, "3DBall")
+    assert (model.hidden, ppo.lr, ppo.gamma) == ([8, 4], 2e-4, 0.9)
+
+
 def test_run_folder_is_named_by_env_and_by_the_user() -> None:
     assert compose_config(["output_dir=there"]).run_dir.parent == Path("there/3DBall")
     assert compose_config(["hydra.run.dir=mine"]).run_dir == Path("mine")
@@ -143,6 +166,13 @@ def test_run_folder_is_named_by_env_and_by_the_user() -> None:
         ("seed", ["seed has no value", "seed=value"]),
         ("a b=3", ["'a b=3'", "option=value"]),
         ("--cfg", ["--cfg is not an option", "option=value", "--help"]),
+        (
+            "behaviors.3DBall.ppo.lr",
+            ["behaviors.3DBall.ppo.lr has no value", "behaviors.3DBall.ppo.lr=value"],
+        ),
+        ("behaviors.3DBall.ppo.lr=[1,", ["behaviors.3DBall.ppo.lr=[1, cannot be read"]),
+        ("behaviors.3DBall.ppo.lr=1,2", ["several values", "mappo-train -m behaviors.3DBall.ppo.lr=1,2"]),
+        ("behaviors.3DBall.ppo.lr=interval(1,2)", ["interval is not taken", "give values"]),
         ("ppo.lr=[1,", ["ppo.lr=[1,", "cannot be read", "in quotes"]),
         ("seed=1,2", ["seed=1,2", "needs -m"]),
         ("ppo.lr=${nothing}", ["ppo.lr", "nothing", "not found"]),

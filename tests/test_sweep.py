@@ -13,6 +13,7 @@ import fake_training
 import pytest
 
 from mappo_unity.cli import train_main
+from mappo_unity.compose import load_config
 from mappo_unity.config import ConfigError
 from mappo_unity.sweep import plan_jobs, run_sweep
 
@@ -89,6 +90,21 @@ def test_a_sweep_over_environments_has_one_folder() -> None:
     assert run_sweep(lines).exit_code == 0
     names = [(only_sweep("several") / str(job) / "config.yaml").read_text() for job in range(2)]
     assert ["name: 3DBall" in names[0], "name: custom" in names[1]] == [True, True]
+
+
+def test_a_sweep_over_options_of_a_behavior(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = ["behaviors.3DBall.ppo.lr=1e-3,1e-4", "behaviors.3DBall.model.hidden=[8],[4,4]"]
+    lines += ["behaviors.3DBall.ppo.optimizer=adamw", "behaviors={3DBall: {ppo: {gamma: 0.9}}}"]
+    assert train_main(["-m", *lines]) == 0
+    saved = [load_config(only_sweep() / str(job) / "config.yaml").behaviors["3DBall"] for job in range(4)]
+    values = [(behavior["ppo"]["lr"], behavior["model"]["hidden"]) for behavior in saved]
+    assert values == [(1e-3, [8]), (1e-3, [4, 4]), (1e-4, [8]), (1e-4, [4, 4])]
+    assert all(
+        (behavior["ppo"]["optimizer"], behavior["ppo"]["gamma"]) == ("adamw", 0.9) for behavior in saved
+    )
+    columns = ("behaviors.3DBall.ppo.lr", "behaviors.3DBall.model.hidden")
+    rows = [tuple(row[column] for column in columns) for row in results(only_sweep())]
+    assert sorted(rows) == [("0.0001", "[4,4]"), ("0.0001", "[8]"), ("0.001", "[4,4]"), ("0.001", "[8]")]
 
 
 @pytest.mark.parametrize(
