@@ -41,6 +41,10 @@ def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv
     Raises:
         ConfigError: the options name nothing that can be opened.
     """
+    if cfg.backend in (Backend.embedded, Backend.custom) and "seed" in cfg.params:
+        raise ConfigError(
+            f"env.params.seed={cfg.params['seed']}: the environment's seed follows from the run's; use seed=N"
+        )
     if cfg.backend is Backend.embedded:
         return _embedded(cfg)
     if cfg.backend is Backend.custom:

@@ -87,6 +87,8 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
     Raises ConfigError: there is no such scene, or it does not take them.
     """
     fixed: dict[str, Any] = dict(params or {}) | ({} if num_areas is None else {"num_areas": num_areas})
+    if "seed" in fixed:
+        raise ConfigError("--param seed: the seed is the trainer's to choose")
     if ":" in scene:
         from mappo_unity.backend import call_factory, check_call, load_factory
 

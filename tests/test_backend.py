@@ -516,6 +516,13 @@ class TestCustom:
                 f'  File "{tmp_path}/broken_by_hand.py", line 1, in <module>'
             ]
 
+    @pytest.mark.parametrize("backend", [Backend.custom, Backend.embedded])
+    def test_the_seed_is_no_parameter(self, backend: Backend) -> None:
+        factory = "test_backend:refuse" if backend is Backend.custom else None
+        cfg = EnvConfig(name="3DBall", backend=backend, factory=factory, params={"seed": 3})
+        with pytest.raises(ConfigError, match="env.params.seed=3: .* use seed=N$"):
+            make_env_function(cfg)
+
     def test_a_failure_of_its_own_passes(self) -> None:
         cfg = EnvConfig(backend=Backend.custom, factory="test_backend:refuse", params={"size": 2})
         with pytest.raises(EnvironmentFailure, match="^the simulator is gone$"):

@@ -374,6 +374,7 @@ class TestCommand:
                 ["3DBall", "--param", "mass=-1"],
                 "parameter mass=-1 of scene 3DBall is out of range: it must be > 0",
             ),
+            (["3DBall", "--param", "seed=3"], "--param seed: the seed is the trainer's to choose"),
             (["3DBall", "--param", "num_areas=0"], "num_areas=0 must be a whole number >= 1"),
             (["3DBall", "--param", "num_threads=1.5"], "num_threads=1.5 must be a whole number >= 1"),
             (
