@@ -134,6 +134,8 @@ def _train_command(lines: list[str]) -> int:
     if "-m" in lines or "--multirun" in lines:
         return _sweep([line for line in lines if line not in ("-m", "--multirun")])
     resume = given(lines, "resume")
+    if resume == "":
+        raise ConfigError("resume= is empty: it must name a run folder or a checkpoint file")
     return _train_anew(lines) if resume is None else _train_on(lines, Path(str(resume)))
 
 

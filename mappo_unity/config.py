@@ -433,6 +433,7 @@ class EvalConfig:
     """Environment to play in, a preset in conf/env; null: that of the run."""
 
     def __post_init__(self) -> None:
+        _not_empty(run=self.run, opponent=self.opponent, env=self.env)
         _at_least("episodes", self.episodes, 1)
         _within("seed", self.seed, 0, 2**31 - 1)
 
@@ -447,6 +448,7 @@ class ExportConfig:
     """File (NAME.onnx) or folder to write; null: beside the checkpoint, under its name."""
 
     def __post_init__(self) -> None:
+        _not_empty(run=self.run)
         if self.out == "":
             raise ConfigError("out= is empty: it must name a file or a folder (null: beside the checkpoint)")
 
@@ -475,6 +477,7 @@ class PlayConfig:
     """Height of the picture in pixels, even."""
 
     def __post_init__(self) -> None:
+        _not_empty(run=self.run, env=self.env, policy=self.policy, video=self.video)
         _above("seconds", self.seconds, 0)
         _within("seed", self.seed, 0, 2**31 - 1)
         for option, size in (("width", self.width), ("height", self.height)):
@@ -486,6 +489,12 @@ class PlayConfig:
             )
         if self.run is not None and self.policy is not None:
             raise ConfigError(f"run={self.run} and policy={self.policy} both say who plays: give one of them")
+
+
+def _not_empty(**options: Optional[str]) -> None:
+    for name, value in options.items():
+        if value == "":
+            raise ConfigError(f"{name}= is empty: give it a value, or leave it out")
 
 
 def _rule(option: str, value: float | None, holds: bool, rule: str) -> None:

@@ -374,6 +374,7 @@ def test_what_cannot_go_on_is_told(training: FakeTraining, capsys: pytest.Captur
     capsys.readouterr()
     Path("other").mkdir()
     for line, words in (
+        ("resume=", ["resume= is empty", "a run folder or a checkpoint"]),
         ("resume=nowhere", ["resume=nowhere does not exist", "empty"]),
         ("resume=other", ["resume=other is neither a run folder nor a checkpoint"]),
         ("resume=empty", ["empty holds no checkpoint"]),
@@ -443,6 +444,7 @@ def test_evaluation_prints_a_table_and_one_line_of_json(
     ("lines", "word"),
     [
         ([], "run is not given"),
+        (["run="], "run= is empty"),
         (["run=nowhere"], "run=nowhere does not exist"),
         (["run=nowhere", "episodes=x"], "episodes=x does not fit: episodes must be a whole number"),
         (["run=a", "episodes=0"], "episodes=0 is out of range"),

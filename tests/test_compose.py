@@ -354,6 +354,8 @@ def test_evaluation_options() -> None:
     for lines, word in (
         (["episodes=3"], "run is not given"),
         (["run=x", "episodes=0"], "episodes=0 is out of range"),
+        (["run="], "run= is empty"),
+        (["run=x", "opponent="], "opponent= is empty"),
         (["run=x", "episode=3"], "did you mean episodes"),
         (["run=x", "deterministic=2"], "true or false"),
     ):
