@@ -27,11 +27,13 @@ from mappo_unity.atomic import write_atomically
 from mappo_unity.behavior_lines import dotted_options, readable_lines
 from mappo_unity.compose import Composed, check_effect, check_factory, compose_config, to_config
 from mappo_unity.config import Config, ConfigError
+from mappo_unity.interrupts import interrupts_wait
 from mappo_unity.overrides import check_overrides, given, open_line, parse, quoted
 from mappo_unity.presets import conf_dir, group_choices
 from mappo_unity.run_lock import locked
 from mappo_unity.runs import NewFolder, create_folder, discard_folder, write_record
-from mappo_unity.termination import Interrupted, termination_as_interrupt
+from mappo_unity.stopping import Patience, job_signals, sweep_signals
+from mappo_unity.termination import Interrupted
 
 RESULT = "result.json"
 GOOD = ("finished", "solved")
@@ -72,9 +74,9 @@ def run_sweep(lines: list[str]) -> SweepResult:
     """Check every job's options, then run the jobs; raises ConfigError before the first one starts."""
     planned = plan_jobs(lines)
     folder = _sweep_folder(lines, planned)
-    result = SweepResult(folder.path)
+    result, patience = SweepResult(folder.path), Patience()
     try:
-        with termination_as_interrupt():
+        with sweep_signals(patience, parallel=given(lines, "hydra/launcher") == "joblib"):
             _launch([*_without(lines, "hydra.sweep.dir"), f"hydra.sweep.dir={quoted(folder.path)}"])
     except KeyboardInterrupt as error:
         result.signal = getattr(error, "signal", int(signal.SIGINT))
@@ -82,8 +84,10 @@ def run_sweep(lines: list[str]) -> SweepResult:
         discard_folder(folder)
         raise ConfigError(f"the sweep cannot start: {error}") from error
     except Exception as error:
-        traceback.print_exc()
-        result.error = f"{type(error).__name__}: {error}"
+        if patience.number is None:  # else a search misses the jobs that were ended
+            traceback.print_exc()
+            result.error = f"{type(error).__name__}: {error}"
+    result.signal = result.signal or patience.number
     result.jobs = _rank(_read_results(folder.path) + _missing(folder.path, planned))
     return result
 
@@ -121,8 +125,14 @@ def run_job(tree: DictConfig) -> float | None:
     """Run one job in the folder that Hydra gave it, write result.json, return return_mean.
 
     Never raises for a failure of the job (it is in the result); raises Interrupted where a signal
-    ended it, so that the sweep ends too.
+    ended it, so that the sweep ends too (in a process of its own it returns None, for later jobs too).
     """
+    with job_signals() as may_begin:
+        return _run_job(tree) if may_begin else None
+    return None
+
+
+def _run_job(tree: DictConfig) -> float | None:
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
     result = JobResult(int(hydra.job.num), [line.lstrip("+") for line in hydra.overrides.task], "failed")
@@ -165,11 +175,11 @@ def job_options(job: JobResult) -> dict[str, str]:
     return options
 
 
-
 def _train(config: Config, folder: Path, result: JobResult) -> int | None:
     write_record(folder, config, result.overrides)
     check_factory(config)
-    from mappo_unity.train import train
+    with interrupts_wait():
+        from mappo_unity.train import train
 
     outcome = train(config, folder)
     result.status = outcome.status

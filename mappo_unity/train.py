@@ -32,6 +32,7 @@ from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
 from mappo_unity.models import JointPolicy
 from mappo_unity.rng import get_rng_state, set_rng_state
 from mappo_unity.series import MatchSeries
+from mappo_unity.stopping import ECHO_S
 from mappo_unity.transforms import transformed
 
 
@@ -82,6 +83,7 @@ class Trainer:
         self.matches = MatchSeries(cfg, folder, self.env.behaviors)
         self.last_checkpoint: Path | None = None
         self.stop_signal: int | None = None
+        self.stopped_s = 0.0  # when it came
         self.resumed = False
         self._rng_state: dict[str, Any] | None = None  # of the checkpoint that is continued
         self.log: RunLog | None = None
@@ -249,8 +251,10 @@ class Trainer:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.stop_signal is not None:
-            raise KeyboardInterrupt
-        self.stop_signal = number
+            if time.monotonic() - self.stopped_s > ECHO_S:
+                raise KeyboardInterrupt
+            return
+        self.stop_signal, self.stopped_s = number, time.monotonic()
         if self.log is not None:
             self.log.message("stopping after this iteration, with a checkpoint; once more to stop at once")
 

@@ -5,13 +5,17 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import fake_training
 import pytest
 
+from mappo_unity import stopping
 from mappo_unity.cli import train_main
 from mappo_unity.compose import load_config
 from mappo_unity.config import ConfigError
@@ -171,24 +175,96 @@ def test_a_failed_trial_ends_no_search() -> None:
     assert result.exit_code == 1
 
 
-def test_joblib_runs_jobs_in_processes_of_their_own(tmp_path: Path) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    # Every process of this interpreter starts with the fake training in the place of the real one.
+def start_with_fake_training(tmp_path: Path, *lines: str) -> subprocess.Popen[str]:
+    """Start a sweep; every process of its interpreter has the fake training in the place of the real one."""
     starter = "import sys, fake_training\nsys.modules['mappo_unity.train'] = fake_training\n"
     (tmp_path / "start").mkdir()
     (tmp_path / "start" / "sitecustomize.py").write_text(starter)
     tests = Path(__file__).resolve().parent
     paths = [str(tmp_path / "start"), str(tests), str(tests.parent)]
-    done = subprocess.run(
-        [sys.executable, "-c", "import sys; from mappo_unity.cli import train_main; sys.exit(train_main())"]
-        + ["-m", "hydra/launcher=joblib", "seed=0,1,13,5"],
-        capture_output=True,
+    code = "import sys; from mappo_unity.cli import train_main; sys.exit(train_main())"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "-m", *lines],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-        timeout=120,
+        start_new_session=True,
     )
-    assert done.returncode == 1, done.stderr
-    assert "UserWarning" not in done.stderr
+
+
+def interrupt_two_jobs(
+    process: subprocess.Popen[str], tmp_path: Path, send: Callable[[int, int], None], number: int
+) -> str:
+    """Send a signal when two jobs train; return what was written to stderr."""
+    try:
+        deadline = time.monotonic() + 60
+        while len(list(tmp_path.rglob("metrics.csv"))) < 2 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        send(process.pid, number)
+        return process.communicate(timeout=60)[1]
+    finally:
+        process.kill()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of process groups")
+@pytest.mark.parametrize(
+    ("send", "number"), [(os.killpg, signal.SIGINT), (os.killpg, signal.SIGTERM), (os.kill, signal.SIGTERM)]
+)
+def test_joblib_waits_for_the_checkpoints_of_its_jobs(
+    send: Callable[[int, int], None], number: signal.Signals, tmp_path: Path
+) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    process = start_with_fake_training(
+        tmp_path, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=91,92,93"
+    )
+    errors = interrupt_two_jobs(process, tmp_path, send, number)
+    assert process.returncode == 128 + number, errors
+    assert "once more to stop at once" in errors
+    status = {row["seed"]: row["status"] for row in results(only_sweep())}
+    assert status == {"91": "interrupted", "92": "interrupted", "93": "no result"}
+    assert len(list(only_sweep().rglob("checkpoint"))) == 2
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of process groups")
+def test_a_search_of_processes_ends_by_its_signal(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    lines = ["hydra/launcher=joblib", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=6", "seed=91"]
+    process = start_with_fake_training(tmp_path, *lines)
+    errors = interrupt_two_jobs(process, tmp_path, os.killpg, signal.SIGINT)
+    assert process.returncode == 130 and "Traceback" not in errors, errors
+    assert {row["status"] for row in results(only_sweep())} == {"interrupted"}
+
+
+def test_a_second_signal_waits_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stopping, "_hand_on", lambda number: None)
+    patience = stopping.Patience()
+    with stopping.sweep_signals(patience, parallel=True):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)  # to the process, and to its group: that is one
+        monkeypatch.setattr(stopping, "ECHO_S", -1.0)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert patience.number == signal.SIGINT
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_the_wait_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stopping, "_hand_on", lambda number: None)
+    monkeypatch.setattr(stopping, "GRACE_S", 0.1)
+    monkeypatch.setattr(stopping, "ECHO_S", 0.05)
+    with pytest.raises(KeyboardInterrupt), stopping.sweep_signals(stopping.Patience(), parallel=True):
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(5)
+
+
+def test_joblib_runs_jobs_in_processes_of_their_own(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    process = start_with_fake_training(tmp_path, "hydra/launcher=joblib", "seed=0,1,13,5")
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1, errors
+    assert "UserWarning" not in errors
     rows = results(only_sweep())
     assert [(row["seed"], row["status"]) for row in rows] == [
         ("5", "finished"),
@@ -196,4 +272,4 @@ def test_joblib_runs_jobs_in_processes_of_their_own(tmp_path: Path) -> None:
         ("0", "finished"),
         ("13", "failed"),
     ]
-    assert "unlucky" in done.stderr
+    assert "unlucky" in errors

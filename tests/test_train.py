@@ -203,6 +203,23 @@ def test_signals_end_with_a_checkpoint_a_line_and_their_exit_code(tmp_path, numb
     assert checkpoint.load(last)["iteration"] == len(rows(run))
 
 
+def test_a_signal_to_the_process_and_to_its_group_is_one(tmp_path, monkeypatch):
+    iterate = Trainer.iterate
+
+    def signalled(trainer, batches):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        iterate(trainer, batches)
+
+    monkeypatch.setattr(Trainer, "iterate", signalled)
+    outcome = train(options(4), tmp_path)
+    assert (outcome.status, outcome.signal) == ("interrupted", signal.SIGINT)
+    assert outcome.last_checkpoint.is_file()
+    monkeypatch.setattr("mappo_unity.train.ECHO_S", -1.0)
+    with pytest.raises(KeyboardInterrupt):
+        train(options(4), tmp_path / "other")
+
+
 @pytest.mark.slow
 def test_twenty_kills_end_like_an_undisturbed_run(tmp_path):
     steps = ["max_steps=60000", "checkpoint_interval=1500", "hydra.run.dir=run"]

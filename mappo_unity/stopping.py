@@ -1,0 +1,137 @@
+"""How signals end a sweep: at once where jobs run one by one, with a wait where they run side by side.
+
+In: SIGINT and SIGTERM. Out: `Interrupted`, or the number of the signal once the jobs have written their
+checkpoints. A launcher of processes kills them when its own one is interrupted; so that one does not take the
+first signal as its own, but hands it on, and waits. Knows nothing of training.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+
+from mappo_unity.termination import Interrupted, termination_as_interrupt
+
+GRACE_S = 30.0
+ECHO_S = 0.5  # the same signal, once to the process and once to its group, is one; a second one comes later
+
+
+class Patience:
+    """Handle the signals of the process that started the jobs: the first makes it wait, a second ends it."""
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self._since_s = 0.0
+        self._timer: threading.Timer | None = None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Take a signal; raises Interrupted for the second one, or GRACE_S after the first."""
+        if self.number is not None:
+            if time.monotonic() - self._since_s > ECHO_S:
+                raise Interrupted(self.number)
+            return
+        self.number, self._since_s = number, time.monotonic()
+        print(
+            f"waiting up to {GRACE_S:.0f} s for the jobs' checkpoints; once more to stop at once",
+            file=sys.stderr,
+            flush=True,
+        )
+        if os.name == "posix":
+            _hand_on(number)
+            self._timer = threading.Timer(GRACE_S, os.kill, (os.getpid(), number))
+            self._timer.daemon = True
+            self._timer.start()
+
+    def end(self) -> None:
+        """Wait no longer."""
+        if self._timer is not None:
+            self._timer.cancel()
+
+
+def _hand_on(number: int) -> None:
+    for child in multiprocessing.active_children():
+        with suppress(OSError, TypeError):  # it has ended
+            os.kill(child.pid, number)  # type: ignore[arg-type]
+
+
+_sweep: Patience | None = None  # in the process of the sweep; None in those of its jobs
+
+
+@contextmanager
+def sweep_signals(patience: Patience, parallel: bool) -> Iterator[None]:
+    """Between jobs, let SIGTERM end a sweep as Ctrl-C does: with its table and its exit code.
+
+    With `parallel` (jobs in processes of their own) both wait for the jobs, as `patience` does.
+    """
+    global _sweep
+    _sweep = patience
+    try:
+        with _waiting(patience) if parallel else termination_as_interrupt():
+            yield
+    finally:
+        _sweep = None
+
+
+@contextmanager
+def _waiting(patience: Patience) -> Iterator[None]:
+    before = {number: signal.signal(number, patience) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        patience.end()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _JobProcess:
+    """The signals of a process that does one job after the other."""
+
+    def __init__(self) -> None:
+        self.stopped_by: int | None = None
+        self._busy = False
+        self._installed = False
+
+    def begin(self) -> None:
+        if not self._installed and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self)
+            signal.signal(signal.SIGTERM, self)
+            self._installed = True
+        self._busy = self.stopped_by is None
+
+    def end(self) -> None:
+        self._busy = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        first, self.stopped_by = self.stopped_by is None, number
+        if first and self._busy:  # outside a job there is nothing to end, and the launcher must not break
+            raise Interrupted(number)
+
+
+_process = _JobProcess()
+
+
+@contextmanager
+def job_signals() -> Iterator[bool]:
+    """Yield whether a job may begin; a signal that ends it ends the later ones of its process.
+
+    Raises Interrupted only in the process of the sweep: a launcher kills all others at the first exception.
+    """
+    if _sweep is not None:
+        if _sweep.number is not None:
+            raise Interrupted(_sweep.number)
+        yield True
+        return
+    _process.begin()
+    try:
+        yield _process.stopped_by is None
+    except Interrupted as error:
+        _process.stopped_by = error.signal
+    finally:
+        _process.end()
