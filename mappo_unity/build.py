@@ -19,6 +19,7 @@ from mappo_unity.encoders import ObsLayout
 from mappo_unity.models import make_actor, make_critic
 from mappo_unity.ppo import PolicyLearner
 from mappo_unity.rng import seed_everything
+from mappo_unity.runs import PLAYERS
 from mappo_unity.unity_env import UnityEnv
 
 
@@ -34,7 +35,7 @@ def prepare_torch(cfg: Config) -> None:
 def make_unity_env(cfg: Config, folder: Path) -> UnityEnv:
     """Open the environment of the options behind the adapter; players log below the run's folder."""
     return UnityEnv(
-        make_env_function(cfg.env, folder / "players"),
+        make_env_function(cfg.env, folder / PLAYERS),
         cfg.seed,
         action_limit=CONTINUOUS_LIMIT,
         max_team_size=cfg.env.max_team_size,

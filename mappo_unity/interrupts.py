@@ -1,35 +1,43 @@
-"""Ctrl-C while a command starts.
+"""Signals during a block: who takes them, and Ctrl-C while a command starts.
 
-In: a block of imports and reading of options. Out: the interrupt, after the block. Extension modules (NumPy,
-torch, MuJoCo) lose an interrupt that arrives while they are loaded, or are left half loaded by it.
+In: a block, such as one of imports and reading of options. Out: the interrupt, after the block. Extension
+modules (NumPy, torch, MuJoCo) lose an interrupt that arrives while they are loaded, or are left half loaded.
 """
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
+
+
+@contextmanager
+def handled(handler: Callable[[int, FrameType | None], Any], *numbers: int) -> Iterator[None]:
+    """Let `handler` take these signals during the block; in other threads than the main one, do nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)
 
 
 @contextmanager
 def interrupts_wait() -> Iterator[None]:
-    """Keep SIGINT back until the block has ended; in other threads, which get no signals, do nothing."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    """Keep SIGINT back until the block has ended."""
     came: list[int] = []
-
-    def remember(number: int, frame: FrameType | None) -> None:
-        came.append(number)
-
-    previous = signal.signal(signal.SIGINT, remember)
     try:
-        yield
+        with handled(lambda number, frame: came.append(number), signal.SIGINT):
+            yield
     finally:
-        signal.signal(signal.SIGINT, previous)
-        if came and callable(previous):
-            previous(came[0], None)
-        elif came:
-            raise KeyboardInterrupt
+        if came:
+            waiting = signal.getsignal(signal.SIGINT)
+            if not callable(waiting):
+                raise KeyboardInterrupt
+            waiting(came[0], None)

@@ -10,6 +10,7 @@ groups) is positive at its end has won, one with a negative one has lost; anythi
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,15 +97,21 @@ def find_sides(env: BaseEnv) -> dict[int, list[str]]:
         ConfigError: there are not two sides.
     """
     env.reset()
-    sides: dict[int, list[str]] = {}
-    for name in env.behavior_specs:
-        sides.setdefault(team_id(name), []).append(name)
+    sides = sides_of(env.behavior_specs)
     if len(sides) != 2:
         raise ConfigError(
             f"opponent=...: matches need an environment with two sides (team ids); this one has "
             f"{len(sides)}: {', '.join(env.behavior_specs)}"
         )
     return dict(sorted(sides.items()))
+
+
+def sides_of(behaviors: Iterable[str]) -> dict[int, list[str]]:
+    """Return the behaviors of each side by its team id; matches need two sides."""
+    sides: dict[int, list[str]] = {}
+    for name in behaviors:
+        sides.setdefault(team_id(name), []).append(name)
+    return sides
 
 
 def play_side(env: BaseEnv, policies: dict[str, Policy], own: list[str], matches: int) -> Score:

@@ -13,10 +13,10 @@ import torch
 
 from mappo_unity.backend import make_env_function
 from mappo_unity.config import Config, ConfigError
-from mappo_unity.keys import team_id
-from mappo_unity.matches import Score, play_matches
+from mappo_unity.matches import Score, play_matches, sides_of
 from mappo_unity.models import UnityActor
 from mappo_unity.policies import ActorPolicy, RandomPolicy
+from mappo_unity.runs import PLAYERS
 
 
 class MatchSeries:
@@ -40,7 +40,7 @@ class MatchSeries:
         self._played_at = 0
         self.points: float | None = None
         self.said = ""
-        self.two_sided = len({team_id(name) for name in names}) == 2
+        self.two_sided = len(sides_of(names)) == 2
         if cfg.matches.interval is not None and not self.two_sided:
             raise ConfigError(
                 f"matches.interval={cfg.matches.interval}: matches need an environment with two sides (team "
@@ -60,7 +60,7 @@ class MatchSeries:
         player = ActorPolicy(layout, actors, False, "the policy")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(cfg.seed + agent_steps)
-            make_env = make_env_function(cfg.env, self._folder / "players" / "matches")
+            make_env = make_env_function(cfg.env, self._folder / PLAYERS / "matches")
             seed = (cfg.seed + agent_steps) % 2**31
             scores = play_matches(make_env, player, RandomPolicy(seed), cfg.matches.count, seed)
         if self._interval_is_over(agent_steps):  # the last series leaves the rhythm of a longer run alone

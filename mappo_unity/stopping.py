@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
+from mappo_unity.interrupts import handled
 from mappo_unity.termination import Interrupted, termination_as_interrupt
 
 GRACE_S = 30.0
@@ -81,13 +82,11 @@ def sweep_signals(patience: Patience, parallel: bool) -> Iterator[None]:
 
 @contextmanager
 def _waiting(patience: Patience) -> Iterator[None]:
-    before = {number: signal.signal(number, patience) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        patience.end()
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with handled(patience, signal.SIGINT, signal.SIGTERM):
+        try:
+            yield
+        finally:
+            patience.end()
 
 
 class _JobProcess:
