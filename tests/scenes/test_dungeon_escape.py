@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -414,3 +416,12 @@ def test_unitys_policy_frees_areas(shared: Path) -> None:
     policy = run_policy.OfficialPolicy(file, np.random.default_rng(0), False)
     done = run_policy.play(make_scene("DungeonEscape", num_areas=24), {"DungeonEscape": policy}, 500, 2000)
     assert np.mean([row[1] for row in done[NAME]]) > 0.54
+
+
+def test_the_script_counts_freed_areas() -> None:
+    script = Path(__file__).resolve().parents[2] / "scripts" / "check_dungeon.py"
+    command = [sys.executable, str(script), "--policy", "random", "--episodes", "40", "--num-areas", "16"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    total, *turns = [line.rpartition(" of ")[2].split()[0] for line in done.stdout.splitlines()]
+    assert int(total) >= 40 and sum(map(int, turns)) == int(total)

@@ -1,0 +1,74 @@
+#!/usr/bin/env python3
+"""Count the areas of DungeonEscape that a policy frees, over all and by the platform's quarter turn.
+
+    scripts/check_dungeon.py --policy DungeonEscape.onnx [--episodes 800] [--num-areas 64] [--seed 0]
+    scripts/check_dungeon.py --policy random
+
+An episode of an area ends when the door is unlocked (freed), the dragon or the last player reaches the
+portal, or at the time limit. docs/scenes/DungeonEscape.md has the figures of Unity's policy.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mappo_unity.evaluate import open_policy
+from mappo_unity.scenes.dungeon_escape import DungeonEscape
+from mappo_unity.scenes.dungeon_layout import DRAGON, DRAGON_START_YAW
+
+
+class CountingDungeon(DungeonEscape):
+    """Note how every area's episode ended; `outcomes`: (quarter turn, freed)."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.outcomes: list[tuple[int, bool]] = []
+        self._turn = np.zeros(self.num_areas, int)
+        self._freed = np.zeros(self.num_areas, bool)
+
+    def _unlock(self, areas: np.ndarray) -> None:
+        self._freed[areas] = True
+        super()._unlock(areas)
+
+    def _reset_areas(self, areas: np.ndarray) -> None:
+        if self.started:
+            pairs = zip(self._turn[areas].tolist(), self._freed[areas].tolist(), strict=True)
+            self.outcomes += list(pairs)
+        self._freed[areas] = False
+        super()._reset_areas(areas)
+        yaw = self.room.thing_yaw[areas, DRAGON]
+        self._turn[areas] = np.abs(yaw[:, None] - DRAGON_START_YAW).argmin(axis=1)
+
+
+def main() -> None:
+    """Play, and print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--policy", required=True, help="an ONNX file, a run, or random")
+    parser.add_argument("--episodes", type=int, default=800, help="of areas, at least")
+    parser.add_argument("--num-areas", type=int, default=64)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    env = CountingDungeon(num_areas=options.num_areas, seed=options.seed)
+    policy = open_policy(options.policy, deterministic=False, seed=options.seed, option="policy")
+    env.reset()
+    while len(env.outcomes) < options.episodes:
+        for name, spec in env.behavior_specs.items():
+            decisions, _ = env.get_steps(name)
+            if len(decisions):
+                env.set_actions(name, policy.act(name, decisions, spec))
+        env.step()
+    turns, freed = map(np.array, zip(*env.outcomes, strict=True))
+    print(f"{Path(options.policy).name}, seed {options.seed}: {freed.mean():.1%} of {len(freed)} areas freed")
+    for turn in range(4):
+        of_turn = freed[turns == turn]
+        print(f"  quarter turn {turn}: {of_turn.mean():.3f} of {len(of_turn)}")
+
+
+if __name__ == "__main__":
+    main()
