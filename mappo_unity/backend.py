@@ -22,6 +22,8 @@ install()
 
 from mlagents_envs.base_env import BaseEnv  # noqa: E402
 
+from mappo_unity.user_env import GuardedEnv  # noqa: E402
+
 MakeEnv = Callable[[int], BaseEnv]
 
 EDITOR_PORT = 5004
@@ -157,7 +159,7 @@ def _describe(cfg: EnvConfig) -> str:
 def _custom(cfg: EnvConfig) -> MakeEnv:
     name = f"env.factory={cfg.factory}"
     factory = load_factory(str(cfg.factory), name)
-    return lambda seed: call_factory(factory, name, seed, cfg.params)
+    return lambda seed: GuardedEnv(call_factory(factory, name, seed, cfg.params), name, _raised)
 
 
 def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapping[str, Any]) -> BaseEnv:
@@ -215,7 +217,7 @@ def load_factory(path: str, name: str) -> Callable[..., Any]:
     return function
 
 
-def _raised(error: Exception, who: str) -> ConfigError:
+def _raised(error: BaseException, who: str) -> ConfigError:
     """Return the mistake "`who` raised ..." with the traceback of the user's code, without our frames."""
     text = str(error).strip()
     mistake = ConfigError(

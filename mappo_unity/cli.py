@@ -1,8 +1,8 @@
 """The commands: the only place that prints. Heavy imports happen inside them.
 
 Exit codes: 0 done, 1 an error of ours (with its traceback) or a failed job of a sweep, 2 a mistake
-in the options, 3 an environment that failed for good (a checkpoint is written first), 130 and 143
-ended by SIGINT and SIGTERM.
+in the options, 3 an environment that failed for good (a checkpoint is written first), 4 a run that
+ended but most of whose updates were rolled back, 130 and 143 ended by SIGINT and SIGTERM.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 from mappo_unity.config import Config, ConfigError, EnvironmentFailure, EvalConfig, ExportConfig, PlayConfig
 from mappo_unity.interrupts import interrupts_wait
 
+_MOST_ROLLED_BACK = 4
 _SIGNALS = {2: "SIGINT", 15: "SIGTERM"}
 
 
@@ -71,7 +72,7 @@ def _run_command(
         print(f"{name}: {error}", *error.details, sep="\n", file=sys.stderr)
         return 2
     except EnvironmentFailure as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        print(f"{name}: {error}", *error.details, sep="\n", file=sys.stderr)
         return 3
     except KeyboardInterrupt as error:
         print(f"{name}: interrupted", file=sys.stderr)
@@ -187,11 +188,18 @@ def _train_locked(config: Config, folder: Path, source: Path, lines: list[str]) 
     checkpoint, warnings = newest_good(source)
     for warning in warnings:
         print(f"mappo-train: {warning}", file=sys.stderr)
+    with interrupts_wait():
+        from mappo_unity.train import why_over
+
+        reason = why_over(config, checkpoint)
+    if reason is not None:
+        print(f"nothing to train, and nothing was changed: the run in {folder} is over: {reason}")
+        return 0
     record = runs.read_record(folder)
     runs.write_record(folder, config, lines)
     try:
         return _train(config, folder, checkpoint)
-    except ConfigError:
+    except BaseException:
         runs.restore_record(folder, record)
         raise
 
@@ -207,7 +215,7 @@ def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
 
     print("\n".join(run_summary(outcome, folder)), flush=True)
     if outcome.signal is None:
-        return 0
+        return _MOST_ROLLED_BACK if outcome.status == "diverged" else 0
     name = _SIGNALS.get(outcome.signal, f"signal {outcome.signal}")
     print(
         f"mappo-train: ended by {name}; checkpoint {outcome.last_checkpoint}; "

@@ -117,6 +117,11 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
                 f"{key} cannot change with resume: the run goes on in its own folder {base.parent}"
             )
     config = compose_config(rest, base).config
+    if config.seed != saved.seed:
+        raise ConfigError(
+            f"seed={config.seed} cannot change with resume: the run has seed={saved.seed}, and its random "
+            "numbers go on where they were; leave seed out, or start a new run without resume"
+        )
     check_effect(rest, [config])
     return config
 

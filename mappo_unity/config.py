@@ -24,7 +24,12 @@ class ConfigError(ValueError):
 
 
 class EnvironmentFailure(RuntimeError):
-    """An environment that ran has failed for good; the message says how, and where its log is."""
+    """An environment that ran has failed for good; the message says how, and where its log is.
+
+    `details`: lines to print below it, such as a traceback of the user's code.
+    """
+
+    details: tuple[str, ...] = ()
 
 
 class Backend(Enum):

@@ -40,6 +40,10 @@ class EpisodeWindow:
         """Whether every behavior has as many episodes as the window holds."""
         return all(len(rows) == self.size for rows in self.recent.values())
 
+    def reached(self, goal: float) -> bool:
+        """Return whether the mean return over a full window is at least `goal`."""
+        return self.full and self.summary()["return_mean"] >= goal
+
     def summary(self) -> dict[str, float]:
         """Return means over the window, over all behaviors and, if several, for each of them.
 

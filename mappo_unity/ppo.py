@@ -56,8 +56,9 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
         self.log_ratio = self.entropy = torch.zeros(())
 
-    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Any:
-        entropy = super()._get_entropy(dist, adv_shape)
+    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Tensor:
+        # TorchRL's own falls back to sampling when a number is not finite; here that is for `_update` to see
+        entropy = dist.entropy().unsqueeze(-1)
         self.entropy = entropy.detach()
         return entropy
 
@@ -107,7 +108,7 @@ class PolicyLearner:
         inputs = [*(str(key) for key in actor.in_keys), *self.critic_keys]
         self.row_keys = list(dict.fromkeys([*inputs, keys.ACTION, keys.LOG_PROB]))
         self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
-        self.rollbacks = 0
+        self.updates = self.rollbacks = 0  # rolled back ones are counted in both
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(max_rows),
             sampler=SamplerWithoutReplacement(),
@@ -229,6 +230,7 @@ class PolicyLearner:
                 break
         metrics = {name: float(value) / steps for name, value in sums.items()}
         healthy = all(math.isfinite(v) for v in metrics.values()) and self._weights_finite()
+        self.updates += 1
         if not healthy or kl_epoch > self.cfg.max_kl:
             self._load_trainable(before)
             self.rollbacks += 1
@@ -287,6 +289,7 @@ class PolicyLearner:
         """Return everything that continuing needs."""
         return self._trainable_state() | {
             "value_norm": self.value_norm.state_dict(),
+            "updates": self.updates,
             "rollbacks": self.rollbacks,
         }
 
@@ -295,13 +298,14 @@ class PolicyLearner:
         self._load_trainable(state)
         self.value_norm.load_state_dict(state["value_norm"])
         self.rollbacks = int(state["rollbacks"])
+        self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2
 
 
 def minibatch_rows(cfg: PPOConfig, rows: int, team_size: int) -> int:
     """Return the team rows of a minibatch."""
     if cfg.num_minibatches is not None:
         return -(-rows // cfg.num_minibatches)
-    return max(1, cfg.minibatch_size // team_size)
+    return min(rows, max(1, cfg.minibatch_size // team_size))
 
 
 def valued(entries: TensorDictBase) -> Tensor:

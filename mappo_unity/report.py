@@ -43,10 +43,26 @@ def run_summary(outcome: Outcome, folder: Path) -> list[str]:
         lines.append(f"best checkpoint: {best}")
     return [
         *lines,
+        *_rollback_lines(outcome.updates),
         f"evaluate:    mappo-eval {shell_argument('run', folder)}",
         f"continue:    mappo-train {shell_argument('resume', folder)}",
         f"curves:      tensorboard --logdir {shell_word(folder)}",
     ]
+
+
+def _rollback_lines(updates: dict[str, tuple[int, int]]) -> list[str]:
+    """Say of which policies updates were rolled back, and what helps where it were many."""
+    rolled_back = {name: counts for name, counts in updates.items() if counts[0]}
+    if not rolled_back:
+        return []
+    counts = ", ".join(f"{rolled:,} of {total:,} of {name}" for name, (rolled, total) in rolled_back.items())
+    lines = [f"updates rolled back (what was collected for them taught nothing): {counts}"]
+    if any(10 * rolled > total for rolled, total in rolled_back.values()):
+        lines.append(
+            "what helps: a smaller ppo.lr, fewer ppo.epochs, ppo.target_kl=0.02 (it ends an update early), "
+            "a larger collect.batch_size, other ppo.num_minibatches; behaviors.NAME.ppo... for one policy"
+        )
+    return lines
 
 
 def sweep_table(result: SweepResult) -> Table:

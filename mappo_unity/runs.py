@@ -11,6 +11,7 @@ import json
 import platform
 import shutil
 import subprocess
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -96,21 +97,21 @@ def write_record(folder: Path, config: Config, lines: list[str]) -> None:
 
 @dataclass(frozen=True)
 class Record:
-    """The record of a run as it was, and the state of its other files (size in bytes, time in ns)."""
+    """The record of a run as it was, and the checkpoints that it had (size in bytes, time in ns)."""
 
     files: dict[str, bytes]
-    others: dict[Path, tuple[int, int]]
+    checkpoints: dict[Path, tuple[int, int]]
 
 
 def read_record(folder: Path) -> Record:
     """Return the record of a run, to be put back by `restore_record`."""
     files = {name: (folder / name).read_bytes() for name in RECORD if (folder / name).is_file()}
-    return Record(files, _other_files(folder))
+    return Record(files, _state_of(folder.rglob("*.pt")))
 
 
 def restore_record(folder: Path, record: Record) -> None:
-    """Put the record back, unless the run went on meanwhile: then what it went on with stays written."""
-    if _other_files(folder) != record.others:
+    """Put the record back, unless a checkpoint was written: then what it was trained with stays written."""
+    if _state_of(folder.rglob("*.pt")) != record.checkpoints:
         return
     for name in RECORD:
         if name in record.files:
@@ -186,7 +187,10 @@ def _history(path: Path) -> list[Any]:
 
 def _other_files(folder: Path) -> dict[Path, tuple[int, int]]:
     found = (path for path in folder.rglob("*") if path.is_file() and path.name not in _NO_WORK)
-    files = (path for path in found if path.relative_to(folder).parts[0] != PLAYERS)
+    return _state_of(path for path in found if path.relative_to(folder).parts[0] != PLAYERS)
+
+
+def _state_of(files: Iterable[Path]) -> dict[Path, tuple[int, int]]:
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
 
 

@@ -114,8 +114,16 @@ class UnityEnv(EnvBase):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go back to a snapshot; the next full reset hands out its observations unchanged."""
+        """Go back to a snapshot; the next full reset hands out its observations unchanged.
+
+        Raises:
+            ConfigError: it is of an environment with other behaviors, or more or fewer slots for agents.
+        """
         self.base_env.set_state(state["scene"])
+        saved = {name: len(entries["acting"]) for name, entries in state["behaviors"].items()}
+        slots = {name: len(behavior.acting) for name, behavior in self._behaviors.items()}
+        if saved != slots:
+            raise ConfigError(f"the snapshot has agent slots {saved}, this environment {slots}")
         for name, behavior in self._behaviors.items():
             behavior.set_state(state["behaviors"][name])
         self._untouched = True

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mappo_unity.config import Config
@@ -25,6 +25,12 @@ class Outcome:
     return_mean: float = 12.5
     best_checkpoint: Path | None = None
     last_checkpoint: Path | None = None
+    updates: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+
+def why_over(cfg: Config, path: Path) -> str | None:
+    """Return None: every run goes on."""
+    return None
 
 
 def train(cfg: Config, folder: Path, resume_from: Path | None = None) -> Outcome:

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import fake_training
 import pytest
 import yaml
 from fake_training import Outcome
@@ -53,9 +54,11 @@ class FakeTraining:
 @pytest.fixture
 def training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeTraining:
     fake = FakeTraining()
-    for name, function in (("train", fake.train), ("checkpoint", fake.newest_good)):
+    fakes = {"train": [fake.train, fake_training.why_over], "checkpoint": [fake.newest_good]}
+    for name, functions in fakes.items():
         module = ModuleType(f"mappo_unity.{name}")
-        setattr(module, function.__name__, function)
+        for function in functions:
+            setattr(module, function.__name__, function)
         monkeypatch.setitem(sys.modules, f"mappo_unity.{name}", module)
     monkeypatch.chdir(tmp_path)
     return fake

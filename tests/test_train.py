@@ -108,7 +108,7 @@ def test_four_iterations_are_two_saved_and_two_more_to_the_bit(tmp_path):
     trainer = Trainer(options(4), tmp_path / "parts")
     real_save = trainer.save
 
-    def save_and_stop(best):
+    def save_and_stop(best=False):
         real_save(best)
         if trainer.iteration == 2:
             raise KeyboardInterrupt
@@ -134,8 +134,16 @@ def test_resume_refuses_another_env_network_or_minibatch(tmp_path):
     checkpoint.save(tmp_path / "other.pt", state | {"env_name": "Walker"})
     with pytest.raises(CheckpointError, match="env=Walker, not for env=3DBall"):
         train(options(2), tmp_path, tmp_path / "other.pt")
-    with pytest.raises(ConfigError, match="ppo.minibatch_size=121 is larger than the batch.*120 decisions"):
-        train(options(1, ppo=PPOConfig(minibatch_size=121)), tmp_path / "x")
+    with pytest.raises(ConfigError, match="ppo.num_minibatches=121 is larger than the batch.*120 team rows"):
+        train(options(1, ppo=PPOConfig(num_minibatches=121)), tmp_path / "x")
+
+
+def test_a_minibatch_larger_than_the_batch_follows_it_with_a_note(tmp_path, capfd):
+    train(options(2, ppo=PPOConfig(minibatch_size=121)), tmp_path / "a")
+    said = "note: ppo.minibatch_size=121 is larger than the batch of 3DBall: 20 rounds x 6 agents"
+    assert said in capfd.readouterr().out
+    train(options(2, ppo=PPOConfig(minibatch_size=120)), tmp_path / "b")
+    assert rows(tmp_path / "a") == rows(tmp_path / "b")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
