@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mappo_unity.config import Schedule
+from mappo_unity.config.schema import Schedule
 
 
 class Advantage(NamedTuple):

@@ -15,7 +15,7 @@ from pathlib import Path
 from traceback import TracebackException
 from typing import Any
 
-from mappo_unity.config import Backend, ConfigError, EnvConfig, EnvironmentFailure
+from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
 from mappo_unity.protobuf import install
 
 install()

@@ -13,9 +13,9 @@ import torch
 
 from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.backend import make_env_function
-from mappo_unity.behavior_options import check_behaviors, options_of
 from mappo_unity.collect import num_rounds
-from mappo_unity.config import Config, ConfigError, ModelConfig
+from mappo_unity.config.per_behavior import check_behaviors, options_of
+from mappo_unity.config.schema import Config, ConfigError, ModelConfig
 from mappo_unity.encoders import ObsLayout
 from mappo_unity.memory import check_free, show_size
 from mappo_unity.models import make_actor, make_critic

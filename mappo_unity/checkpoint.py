@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from mappo_unity.atomic import write_atomically
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 
 FORMAT = 2
 FOLDER = "checkpoints"

@@ -14,7 +14,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.config import Config, ConfigError, EnvironmentFailure, EvalConfig, ExportConfig, PlayConfig
+from mappo_unity.config.schema import (
+    Config,
+    ConfigError,
+    EnvironmentFailure,
+    EvalConfig,
+    ExportConfig,
+    PlayConfig,
+)
 from mappo_unity.interrupts import interrupts_wait
 
 _MOST_ROLLED_BACK = 4
@@ -130,7 +137,7 @@ def _doctor_command(lines: list[str]) -> int:
 
 
 def _train_command(lines: list[str]) -> int:
-    from mappo_unity.overrides import given
+    from mappo_unity.config.overrides import given
 
     if "-m" in lines or "--multirun" in lines:
         return _sweep([line for line in lines if line not in ("-m", "--multirun")])
@@ -143,8 +150,8 @@ def _train_command(lines: list[str]) -> int:
 def _train_anew(lines: list[str]) -> int:
     with interrupts_wait():
         from mappo_unity import runs
-        from mappo_unity.compose import check_effect, check_factory, compose_config
-        from mappo_unity.overrides import given
+        from mappo_unity.config.compose import check_effect, check_factory, compose_config
+        from mappo_unity.config.overrides import given
 
         composed = compose_config(lines)
         check_effect(lines, [composed.config])
@@ -162,7 +169,7 @@ def _train_anew(lines: list[str]) -> int:
 def _train_on(lines: list[str], path: Path) -> int:
     with interrupts_wait():
         from mappo_unity import runs
-        from mappo_unity.compose import check_factory, compose_resumed
+        from mappo_unity.config.compose import check_factory, compose_resumed
 
         folder = runs.find_run(path, "resume")
         config = compose_resumed(lines, folder / runs.CONFIG)
@@ -210,7 +217,7 @@ def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
 
     print(f"continuing from {checkpoint}" if checkpoint else f"run folder: {folder}", flush=True)
     outcome = train(config, folder, checkpoint)
-    from mappo_unity.overrides import shell_argument
+    from mappo_unity.config.overrides import shell_argument
     from mappo_unity.report import run_summary
 
     print("\n".join(run_summary(outcome, folder)), flush=True)
@@ -244,7 +251,7 @@ def _sweep(lines: list[str]) -> int:
 
 def _eval_command(lines: list[str]) -> int:
     with interrupts_wait():
-        from mappo_unity.compose import check_factory, compose_plain, config_to_play
+        from mappo_unity.config.compose import check_factory, compose_plain, config_to_play
 
         options = vars(compose_plain(lines, EvalConfig))
         run = Path(options.pop("run"))
@@ -261,7 +268,7 @@ def _eval_command(lines: list[str]) -> int:
 
 def _play_command(lines: list[str]) -> int:
     with interrupts_wait():
-        from mappo_unity.compose import check_factory, compose_plain, config_to_play
+        from mappo_unity.config.compose import check_factory, compose_plain, config_to_play
 
         options = compose_plain(lines, PlayConfig)
         check_factory(config_to_play(Path(options.run or ""), options.env))
@@ -273,7 +280,7 @@ def _play_command(lines: list[str]) -> int:
 
 
 def _export_command(lines: list[str]) -> int:
-    from mappo_unity.compose import compose_plain
+    from mappo_unity.config.compose import compose_plain
     from mappo_unity.runs import find_run
 
     options = compose_plain(lines, ExportConfig)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType
 
-from mappo_unity.config import CollectConfig
+from mappo_unity.config.schema import CollectConfig
 from mappo_unity.models import JointPolicy
 
 

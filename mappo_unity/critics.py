@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from mappo_unity.config import CriticKind, ModelConfig
+from mappo_unity.config.schema import CriticKind, ModelConfig
 from mappo_unity.encoders import Encoder, ObsLayout
 from mappo_unity.layers import ACTIVATIONS, linear, make_mlp
 

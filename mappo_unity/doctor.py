@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from mappo_unity.arguments import check_duration, check_range
-from mappo_unity.config import ConfigError, EnvironmentFailure
+from mappo_unity.config.schema import ConfigError, EnvironmentFailure
 
 PACKAGES = ("torch", "torchrl", "tensordict", "mlagents-envs", "protobuf", "grpcio", "numpy", "mujoco")
 EDITOR_PORT = 5004

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mappo_unity.checkpoint import CheckpointError
-from mappo_unity.config import ModelConfig
+from mappo_unity.config.schema import ModelConfig
 from mappo_unity.policies import describe_spec
 from mappo_unity.unity_env import UnityEnv
 

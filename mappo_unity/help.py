@@ -9,8 +9,8 @@ from __future__ import annotations
 import shutil
 import textwrap
 
-from mappo_unity.options import Option, option_table, short_type, show_value
-from mappo_unity.presets import all_groups, describe_choices
+from mappo_unity.config.option_table import Option, option_table, short_type, show_value
+from mappo_unity.config.presets import all_groups, describe_choices
 
 TRAIN_USAGE = """\
 Train policies with MAPPO on an ML-Agents environment.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import nn
 
-from mappo_unity.config import Activation
+from mappo_unity.config.schema import Activation
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {
     Activation.tanh: nn.Tanh,

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from mappo_unity.config import ConfigError, LogBackend, LogConfig
+from mappo_unity.config.schema import ConfigError, LogBackend, LogConfig
 from mappo_unity.metrics_file import STEP, MetricsFile, keep_until, read_metrics
 from mappo_unity.progress import Progress
 

@@ -17,7 +17,7 @@ from typing import Any
 from mlagents_envs.base_env import BaseEnv
 
 from mappo_unity.backend import MakeEnv
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.episodes import play
 from mappo_unity.keys import team_id
 from mappo_unity.policies import Policy

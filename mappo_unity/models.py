@@ -17,7 +17,7 @@ from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
 from mappo_unity.actions import ActionDistribution, ActionLayout
-from mappo_unity.config import CriticKind, ModelConfig
+from mappo_unity.config.schema import CriticKind, ModelConfig
 from mappo_unity.critics import CentralCritic, LocalCritic, PooledCritic
 from mappo_unity.encoders import Encoder, ObsLayout
 from mappo_unity.layers import make_mlp

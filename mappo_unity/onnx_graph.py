@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from mappo_unity import __version__
 from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.encoders import OBS_CLIP, Encoder
 from mappo_unity.models import LOG_STD_RANGE, Actor, PerMember
 

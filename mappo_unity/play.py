@@ -13,8 +13,8 @@ from typing import Any, Protocol
 import torch
 
 from mappo_unity.backend import make_env_function
-from mappo_unity.compose import config_to_play
-from mappo_unity.config import Backend, ConfigError, PlayConfig
+from mappo_unity.config.compose import config_to_play
+from mappo_unity.config.schema import Backend, ConfigError, PlayConfig
 from mappo_unity.evaluate import open_policy
 from mappo_unity.policies import Policy
 from mappo_unity.scenes.base import Scene

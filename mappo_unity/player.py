@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, TextIO
 
 from mappo_unity.arguments import check_range
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.protobuf import install
 
 install()

@@ -11,7 +11,7 @@ import sys
 from argparse import Namespace
 from pathlib import Path
 
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 
 
 def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:

@@ -17,7 +17,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity import checkpoint, keys
 from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
-from mappo_unity.config import Activation, ConfigError, CriticKind, ModelConfig
+from mappo_unity.config.schema import Activation, ConfigError, CriticKind, ModelConfig
 from mappo_unity.encoders import ObsLayout
 from mappo_unity.models import make_actor
 

@@ -23,7 +23,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from mappo_unity import keys
 from mappo_unity.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
-from mappo_unity.config import Optimizer, PPOConfig, ValueLoss, ValueNormKind
+from mappo_unity.config.schema import Optimizer, PPOConfig, ValueLoss, ValueNormKind
 from mappo_unity.encoders import RunningNorm
 from mappo_unity.value_norm import ValueNorm
 

@@ -18,7 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.scenes.drawings.shapes import Camera, Kind, Shape
 
 PACKAGES = (

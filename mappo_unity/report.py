@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from mappo_unity.overrides import shell_argument, shell_word
+from mappo_unity.config.overrides import shell_argument, shell_word
 from mappo_unity.sweep import JobResult, SweepResult, job_options, varied_options
 
 if TYPE_CHECKING:

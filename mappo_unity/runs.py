@@ -21,8 +21,8 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from mappo_unity.atomic import write_atomically
-from mappo_unity.config import Config, ConfigError
-from mappo_unity.overrides import shell_argument
+from mappo_unity.config.overrides import shell_argument
+from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.run_lock import LOCK
 
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"

@@ -25,10 +25,11 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from mappo_unity import checkpoint
-from mappo_unity.behavior_options import options_of
 from mappo_unity.build import batch_rounds, make_learners, make_unity_env, prepare_torch
 from mappo_unity.collect import make_collector
-from mappo_unity.config import Config, ConfigError
+from mappo_unity.config.overrides import shell_argument
+from mappo_unity.config.per_behavior import options_of
+from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.drops import drop_episodes
 from mappo_unity.export import RunExports, sample_inputs
 from mappo_unity.fit import check_fits, describe_models, describe_policies
@@ -37,7 +38,6 @@ from mappo_unity.log import RunLog, check_backends
 from mappo_unity.memory import is_out_of_memory
 from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
 from mappo_unity.models import JointPolicy
-from mappo_unity.overrides import shell_argument
 from mappo_unity.rng import get_rng_state, set_rng_state
 from mappo_unity.series import MatchSeries
 from mappo_unity.stopping import ECHO_S

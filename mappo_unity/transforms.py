@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import CatTensors, Compose, ExcludeTransform, Stack, Transform, TransformedEnv
 
 from mappo_unity import keys
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.unity_env import UnityEnv, unchecked
 
 

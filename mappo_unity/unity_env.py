@@ -22,7 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from mappo_unity import keys
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.rounds import BehaviorRounds, Episode
 from mappo_unity.slots import SlotTable, count_teams
 from mappo_unity.specs import make_specs

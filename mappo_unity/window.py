@@ -14,7 +14,7 @@ from typing import Any
 
 import mujoco
 
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.render import Stage
 from mappo_unity.scenes.drawings.shapes import Camera, Shape
 

@@ -24,8 +24,8 @@ import numpy as np
 import torch
 
 from mappo_unity.backend import make_env_function
-from mappo_unity.compose import compose_config
-from mappo_unity.config import Config, ConfigError
+from mappo_unity.config.compose import compose_config
+from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.link import decode, messages
 from mappo_unity.metrics import count_decisions
 from mappo_unity.player import Player, env_function

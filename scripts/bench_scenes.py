@@ -25,7 +25,7 @@ import numpy as np  # noqa: E402
 from mlagents_envs.base_env import ActionSpec, ActionTuple, BaseEnv, BehaviorSpec, DecisionSteps  # noqa: E402
 from omegaconf import OmegaConf  # noqa: E402
 
-from mappo_unity.presets import conf_dir  # noqa: E402
+from mappo_unity.config.presets import conf_dir  # noqa: E402
 from mappo_unity.scenes import make_scene, scene_names  # noqa: E402
 
 RING = 1009  # actions drawn for each agent

@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from mappo_unity.compose import compose_config
-from mappo_unity.config import Config
+from mappo_unity.config.compose import compose_config
+from mappo_unity.config.schema import Config
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # where env.factory finds vmas_env
 

@@ -34,7 +34,7 @@ def renderer() -> Iterator[Any]:
     films = importlib.import_module("films")
     try:
         made = importlib.import_module("mappo_unity.render").Renderer(films.CAMERA, *films.SIZE)
-    except importlib.import_module("mappo_unity.config").ConfigError as error:
+    except importlib.import_module("mappo_unity.config.schema").ConfigError as error:
         pytest.skip(str(error))
     yield made
     made.close()

@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mappo_unity.config import Config
+from mappo_unity.config.schema import Config
 
 
 @dataclass

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from mappo_unity.actions import ActionLayout
-from mappo_unity.config import ModelConfig
+from mappo_unity.config.schema import ModelConfig
 from mappo_unity.encoders import ObsLayout
 from mappo_unity.models import make_actor
 from mappo_unity.onnx_graph import build_model

@@ -7,7 +7,7 @@ import torch
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from mappo_unity.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
-from mappo_unity.config import Schedule
+from mappo_unity.config.schema import Schedule
 
 
 def gae(

@@ -13,8 +13,8 @@ import pytest
 from test_train import assert_same, rows, without_times
 
 from mappo_unity import checkpoint
-from mappo_unity.compose import compose_config
-from mappo_unity.config import Config, ConfigError
+from mappo_unity.config.compose import compose_config
+from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.episodes import summarize
 from mappo_unity.evaluate import play
 from mappo_unity.policies import RandomPolicy

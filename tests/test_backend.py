@@ -21,7 +21,7 @@ import pytest
 
 from mappo_unity.backend import PLAYER_STRIDE, make_env_function
 from mappo_unity.cli import train_main
-from mappo_unity.config import Backend, ConfigError, EnvConfig, EnvironmentFailure
+from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
 from mappo_unity.link.restarts import SEED_STRIDE, RestartingPlayer
 from mappo_unity.link.server import Link
 from mappo_unity.link.several import SeveralPlayers
@@ -305,7 +305,7 @@ class TestEnds:
     SCRIPT = """
 import sys, time
 from mappo_unity.backend import make_env_function
-from mappo_unity.config import Backend, EnvConfig
+from mappo_unity.config.schema import Backend, EnvConfig
 env = make_env_function(EnvConfig(
     backend=Backend.player, file_name=sys.argv[1], player_logs=sys.argv[2], timeout_s=60, num_players=2))(0)
 env.reset()

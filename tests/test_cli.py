@@ -21,9 +21,9 @@ from fake_training import Outcome
 
 from mappo_unity import __version__, run_lock
 from mappo_unity.cli import eval_main, train_main
-from mappo_unity.config import Config, ConfigError, EvalConfig
-from mappo_unity.options import option_table
-from mappo_unity.presets import all_groups, describe_choices
+from mappo_unity.config.option_table import option_table
+from mappo_unity.config.presets import all_groups, describe_choices
+from mappo_unity.config.schema import Config, ConfigError, EvalConfig
 from mappo_unity.run_lock import locked
 from mappo_unity.runs import create_folder, find_run, read_versions
 

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from mappo_unity import compose, presets
-from mappo_unity.behavior_options import options_of
-from mappo_unity.compose import (
+from mappo_unity.config import compose, presets
+from mappo_unity.config.compose import (
     check_effect,
     check_factory,
     compose_config,
@@ -20,10 +19,11 @@ from mappo_unity.compose import (
     compose_resumed,
     load_config,
 )
-from mappo_unity.config import Activation, Config, ConfigError, EvalConfig, LogBackend
-from mappo_unity.options import option_table
-from mappo_unity.overrides import given, shell_argument
-from mappo_unity.presets import conf_dir
+from mappo_unity.config.option_table import option_table
+from mappo_unity.config.overrides import given, shell_argument
+from mappo_unity.config.per_behavior import options_of
+from mappo_unity.config.presets import conf_dir
+from mappo_unity.config.schema import Activation, Config, ConfigError, EvalConfig, LogBackend
 from mappo_unity.runs import CONFIG, write_record
 
 FILES = sorted(path.relative_to(conf_dir()).as_posix() for path in conf_dir().rglob("*.yaml"))
@@ -255,7 +255,7 @@ def test_a_factory_of_the_working_directory_counts(tmp_path: Path, monkeypatch: 
 
 
 def test_a_missing_sweep_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mappo_unity import overrides
+    from mappo_unity.config import overrides
 
     monkeypatch.setattr(overrides, "is_installed", lambda module: False)
     for line, package in (

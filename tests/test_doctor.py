@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from mappo_unity.cli import doctor_main
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.doctor import CURES, diagnose, port_state
 from mappo_unity.player import main as player_main
 

@@ -14,7 +14,7 @@ from fakes import Record, ScriptedEnv, behavior_spec
 from mappo_unity import checkpoint
 from mappo_unity.cli import train_main
 from mappo_unity.collect import make_collector
-from mappo_unity.config import ConfigError, EnvironmentFailure
+from mappo_unity.config.schema import ConfigError, EnvironmentFailure
 from mappo_unity.drops import drop_episodes, episode_rows
 from mappo_unity.episodes import play
 from mappo_unity.policies import RandomPolicy

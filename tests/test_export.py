@@ -13,8 +13,8 @@ from tensordict import TensorDict
 
 from mappo_unity import checkpoint, export
 from mappo_unity.cli import eval_main, export_main
-from mappo_unity.compose import compose_config
-from mappo_unity.config import CollectConfig, Config, EnvConfig, LogConfig, ModelConfig, PPOConfig
+from mappo_unity.config.compose import compose_config
+from mappo_unity.config.schema import CollectConfig, Config, EnvConfig, LogConfig, ModelConfig, PPOConfig
 from mappo_unity.evaluate import evaluate
 from mappo_unity.export import RunExports, export_checkpoint, sample_inputs
 from mappo_unity.onnx_graph import ExportError

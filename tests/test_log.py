@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from mappo_unity.config import ConfigError, LogBackend, LogConfig
+from mappo_unity.config.schema import ConfigError, LogBackend, LogConfig
 from mappo_unity.log import RunLog, read_metrics
 from mappo_unity.metrics_file import MetricsFile, keep_until
 from mappo_unity.progress import Progress, describe
@@ -312,7 +312,7 @@ def test_killed_writer_loses_no_row(tmp_path: Path) -> None:
     code = f"""
 import os, signal
 from pathlib import Path
-from mappo_unity.config import LogBackend, LogConfig
+from mappo_unity.config.schema import LogBackend, LogConfig
 from mappo_unity.log import RunLog
 log = RunLog(LogConfig(backends=[LogBackend.tensorboard], progress=False), Path({str(tmp_path)!r}), 1000)
 for i in range(1, 6):

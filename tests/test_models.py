@@ -9,7 +9,7 @@ from torch.distributions import Categorical, Normal
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity.actions import ActionDistribution, ActionLayout
-from mappo_unity.config import ModelConfig
+from mappo_unity.config.schema import ModelConfig
 from mappo_unity.encoders import ObsLayout, RunningNorm
 from mappo_unity.models import Actor, JointPolicy, make_actor
 from mappo_unity.value_norm import ValueNorm

@@ -12,7 +12,7 @@ from films import CAMERA, SIZE, frames_of
 
 from mappo_unity import runs
 from mappo_unity.cli import play_main
-from mappo_unity.config import (
+from mappo_unity.config.schema import (
     CollectConfig,
     Config,
     ConfigError,

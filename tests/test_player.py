@@ -13,7 +13,7 @@ import pytest
 from fakes import vector_spec
 
 from mappo_unity.cli import player_main
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.link import decode, encode, messages
 from mappo_unity.link.rows import varint_columns
 from mappo_unity.player import Player, env_function, main, play

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from mappo_unity.actions import ActionLayout
-from mappo_unity.config import Activation, ModelConfig, PPOConfig, Schedule, ValueLoss, ValueNormKind
+from mappo_unity.config.schema import Activation, ModelConfig, PPOConfig, Schedule, ValueLoss, ValueNormKind
 from mappo_unity.encoders import ObsLayout
 from mappo_unity.models import make_actor, make_critic
 from mappo_unity.ppo import LEARNS, PolicyLearner

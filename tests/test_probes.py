@@ -5,7 +5,7 @@ import pytest
 import torch
 from probes import PROBES
 
-from mappo_unity.config import (
+from mappo_unity.config.schema import (
     Backend,
     CollectConfig,
     Config,

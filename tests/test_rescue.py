@@ -8,7 +8,7 @@ import torch
 from mappo_unity import checkpoint, memory
 from mappo_unity import train as training
 from mappo_unity.cli import train_main
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.log import RunLog
 from mappo_unity.memory import check_free, is_out_of_memory, show_size
 from mappo_unity.runs import CONFIG

@@ -17,8 +17,8 @@ import pytest
 
 from mappo_unity import stopping
 from mappo_unity.cli import train_main
-from mappo_unity.compose import load_config
-from mappo_unity.config import ConfigError
+from mappo_unity.config.compose import load_config
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.sweep import plan_jobs, run_sweep
 
 

@@ -14,8 +14,8 @@ import torch
 
 from mappo_unity import checkpoint, series
 from mappo_unity.checkpoint import CheckpointError
-from mappo_unity.compose import compose_config
-from mappo_unity.config import (
+from mappo_unity.config.compose import compose_config
+from mappo_unity.config.schema import (
     CollectConfig,
     Config,
     ConfigError,

@@ -10,7 +10,7 @@ from torchrl.modules import ProbabilisticActor
 
 from mappo_unity.actions import ActionLayout
 from mappo_unity.collect import make_collector
-from mappo_unity.config import ModelConfig
+from mappo_unity.config.schema import ModelConfig
 from mappo_unity.encoders import ObsLayout
 from mappo_unity.models import JointPolicy, make_actor
 from mappo_unity.scenes import make_scene

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from mappo_unity.backend import make_env_function
-from mappo_unity.compose import compose_config
-from mappo_unity.config import ConfigError
+from mappo_unity.config.compose import compose_config
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.scenes.check import check_env
 from mappo_unity.train import train
 

@@ -17,8 +17,8 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
-from mappo_unity.config import ConfigError
-from mappo_unity.overrides import shell_word
+from mappo_unity.config.overrides import shell_word
+from mappo_unity.config.schema import ConfigError
 
 _DIE_WITH_PARENT = """
 import ctypes, os, sys

@@ -15,7 +15,7 @@ from typing import Any
 
 import grpc
 
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.link.messages import METHOD, OPTIONS, STATUS_QUIT, message
 
 ADDRESS = "127.0.0.1"

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorSpec, DecisionSteps, TerminalSteps
 
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.scenes import make_scene, scene_names
 
 

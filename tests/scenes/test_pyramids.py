@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.check import check_env
 from mappo_unity.scenes.pyramids import Pyramids

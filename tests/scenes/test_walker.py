@@ -18,7 +18,7 @@ from walker_figures import (
     posed,
 )
 
-from mappo_unity.config import ConfigError
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes import walker_body as body
 from mappo_unity.scenes.check import check_env

@@ -13,8 +13,8 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 
-from mappo_unity.config import ConfigError
-from mappo_unity.options import show_value
+from mappo_unity.config.option_table import show_value
+from mappo_unity.config.schema import ConfigError
 
 _LINE = re.compile(r"(\+\+|\+)?behaviors(?P<inside>(\.[^.=]+)*)=(?P<value>.*)", re.DOTALL)
 _READABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*|\d+")

@@ -1,6 +1,6 @@
 """The options of a command as a table, read from its dataclass.
 
-In: a dataclass of mappo_unity.config. Out: one `Option` a field, with type, default and the
+In: a dataclass of mappo_unity.config.schema. Out: one `Option` a field, with type, default and the
 docstring below the field. Reads the source of the dataclass, imports nothing heavy.
 """
 

@@ -21,9 +21,9 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mappo_unity.behavior_lines import readable_line
-from mappo_unity.config import Config, ConfigError
-from mappo_unity.options import Option, did_you_mean, find_option, option_table, show_value
+from mappo_unity.config.behavior_lines import readable_line
+from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table, show_value
+from mappo_unity.config.schema import Config, ConfigError
 
 SWEEP_EXTRA = {
     "hydra/launcher=joblib": "hydra_joblib_launcher",

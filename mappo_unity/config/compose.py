@@ -20,10 +20,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from mappo_unity import backend_options
-from mappo_unity.config import Config, ConfigError
-from mappo_unity.options import did_you_mean, option_table
-from mappo_unity.overrides import (
+from mappo_unity.config import backend_options
+from mappo_unity.config.option_table import did_you_mean, option_table
+from mappo_unity.config.overrides import (
     SWEEP_EXTRA,
     check_overrides,
     check_value,
@@ -32,7 +31,8 @@ from mappo_unity.overrides import (
     open_line,
     parse,
 )
-from mappo_unity.presets import conf_dir, group_choices
+from mappo_unity.config.presets import conf_dir, group_choices
+from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.runs import CONFIG, find_run
 
 _ALWAYS_SAVED = ("env", "output_dir")

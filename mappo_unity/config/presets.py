@@ -16,7 +16,7 @@ _BASIC = {  # what Hydra brings itself, and takes by default
 
 def conf_dir() -> Path:
     """Return the folder of presets: inside an installed package, or at the top of a checkout."""
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     inside = package / "conf"
     return inside if inside.is_dir() else package.parent / "conf"
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from mappo_unity.config import Backend, Config, ConfigError, EnvConfig
-from mappo_unity.options import show_value
+from mappo_unity.config.option_table import show_value
+from mappo_unity.config.schema import Backend, Config, ConfigError, EnvConfig
 
 _STARTED = (Backend.player, Backend.registry)
 _UNITY = (Backend.player, Backend.editor, Backend.registry)
