@@ -265,7 +265,7 @@ def _examine_rhythm(report: Report, player: Any, steps: int = PATIENCE_STEPS) ->
 
 
 def _examine_contract(report: Report, player: Any) -> None:
-    from mappo_unity.scenes.check import ContractError, check_env
+    from mappo_unity.scenes.core.contract import ContractError, check_env
 
     try:
         seen = check_env(player, steps=PATIENCE_STEPS)

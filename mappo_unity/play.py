@@ -17,9 +17,9 @@ from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import Backend, ConfigError, PlayConfig
 from mappo_unity.evaluate import open_policy
 from mappo_unity.policies import Policy
-from mappo_unity.scenes.base import Scene
+from mappo_unity.scenes.core.scene import Scene
+from mappo_unity.scenes.core.shapes import Camera, Drawing, Shape
 from mappo_unity.scenes.drawings import drawing_of
-from mappo_unity.scenes.drawings.shapes import Camera, Drawing, Shape
 from mappo_unity.termination import termination_as_interrupt
 from mappo_unity.video import VideoFile, check_video
 from mappo_unity.window import Window

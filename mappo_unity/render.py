@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.scenes.drawings.shapes import Camera, Kind, Shape
+from mappo_unity.scenes.core.shapes import Camera, Kind, Shape
 
 PACKAGES = (
     "on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri (EGL), or libosmesa6 with MUJOCO_GL=osmesa"

@@ -20,7 +20,7 @@ import numpy as np
 
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.render import Renderer
-from mappo_unity.scenes.drawings.shapes import Camera, Shape
+from mappo_unity.scenes.core.shapes import Camera, Shape
 
 SUFFIXES = (".mp4", ".gif")
 

@@ -16,7 +16,7 @@ import mujoco
 
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.render import Stage
-from mappo_unity.scenes.drawings.shapes import Camera, Shape
+from mappo_unity.scenes.core.shapes import Camera, Shape
 
 
 class Window:

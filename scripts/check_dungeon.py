@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.evaluate import open_policy
-from mappo_unity.scenes.dungeon_escape import DungeonEscape
-from mappo_unity.scenes.dungeon_layout import DRAGON, DRAGON_START_YAW
+from mappo_unity.scenes.dungeon_escape.layout import DRAGON, DRAGON_START_YAW
+from mappo_unity.scenes.dungeon_escape.scene import DungeonEscape
 
 
 class CountingDungeon(DungeonEscape):

@@ -17,7 +17,7 @@ import numpy as np
 
 from mappo_unity.link import encode, messages
 from mappo_unity.player import Player, env_function
-from mappo_unity.scenes.ball3d import Ball3D
+from mappo_unity.scenes.ball3d.scene import Ball3D
 
 
 class NaNBall(Ball3D):

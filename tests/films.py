@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mappo_unity.scenes.drawings.shapes import Camera, Color
+from mappo_unity.scenes.core.shapes import Camera, Color
 
 SIZE = (160, 96)
 CAMERA = Camera((0.0, 0.0, 0.0), 12.0, yaw=0.0, pitch=30.0)

@@ -19,7 +19,7 @@ from mappo_unity.episodes import summarize
 from mappo_unity.evaluate import play
 from mappo_unity.policies import RandomPolicy
 from mappo_unity.scenes import make_scene, scene_names
-from mappo_unity.scenes.check import check_env
+from mappo_unity.scenes.core.contract import check_env
 from mappo_unity.train import Outcome, Trainer
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -176,7 +176,7 @@ def test_resets_and_bodies_stay_in_their_ranges(name: str, soaking: ModuleType) 
 
 
 def test_soaking_finds_what_is_wrong(soaking: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mappo_unity.scenes.hallway import Hallway
+    from mappo_unity.scenes.hallway.scene import Hallway
 
     begin, observe = Hallway.begin_episode, Hallway.observe
 
@@ -198,16 +198,16 @@ def test_soaking_finds_what_is_wrong(soaking: ModuleType, monkeypatch: pytest.Mo
             soaking.soak("Hallway", 0.0005, 2)
         )
     with monkeypatch.context() as patch:
-        patch.setattr("mappo_unity.scenes.hallway.RUN_SPEED", 90.0)
-        patch.setattr("mappo_unity.scenes.hallway.DRIVE", np.array([90.0, 90.0, 90.0, 90.0, 90.0]))
-        patch.setattr("mappo_unity.scenes.hallway.Hallway._stop_at_walls", lambda self: None)
+        patch.setattr("mappo_unity.scenes.hallway.scene.RUN_SPEED", 90.0)
+        patch.setattr("mappo_unity.scenes.hallway.scene.DRIVE", np.array([90.0, 90.0, 90.0, 90.0, 90.0]))
+        patch.setattr("mappo_unity.scenes.hallway.scene.Hallway._stop_at_walls", lambda self: None)
         assert "reach beyond the end walls" in faults(soaking.soak("Hallway", 0.002, 2))
 
 
 def test_soaking_counts_warnings_of_the_engine(
     soaking: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from mappo_unity.scenes.ball3d import Ball3D
+    from mappo_unity.scenes.ball3d.scene import Ball3D
 
     monkeypatch.chdir(tmp_path)  # MuJoCo keeps a log where it runs
     simulate = Ball3D.simulate

@@ -24,8 +24,8 @@ from mappo_unity.config.schema import (
 )
 from mappo_unity.onnx_policy import OnnxFolder
 from mappo_unity.play import Pace, open_scene, play, policy_of
+from mappo_unity.scenes.core.shapes import RED, ball
 from mappo_unity.scenes.drawings import drawing_of
-from mappo_unity.scenes.drawings.shapes import RED, ball
 from mappo_unity.window import Window
 
 

@@ -13,7 +13,7 @@ from mlagents_envs.base_env import ActionTuple
 
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.scenes import make_scene, scene_names
-from mappo_unity.scenes.ball3d import Ball3D, limited_turn, turned
+from mappo_unity.scenes.ball3d.scene import Ball3D, limited_turn, turned
 
 NAME = "3DBall?team=0"
 TENTH = np.float32(0.1)

@@ -15,8 +15,8 @@ from mlagents_envs.base_env import ActionTuple
 from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.scenes.base import Scene
-from mappo_unity.scenes.specs import Behavior, Parameter, Sensor
+from mappo_unity.scenes.core.scene import Scene
+from mappo_unity.scenes.core.specs import Behavior, Parameter, Sensor
 
 CLOCK = Sensor("Clock", (1,), stack=3)
 OWN = Sensor("Own", (2,))

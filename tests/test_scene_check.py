@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
-from mappo_unity.scenes.ball3d import Ball3D
-from mappo_unity.scenes.check import ContractError, check_env, main, random_actions
+from mappo_unity.scenes.ball3d.scene import Ball3D
+from mappo_unity.scenes.core.contract import ContractError, check_env, main, random_actions
 
 NAME = "3DBall?team=0"
 Steps = tuple[DecisionSteps, TerminalSteps]

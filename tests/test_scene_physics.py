@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mappo_unity.scenes.physics import AreaPhysics
+from mappo_unity.scenes.core.physics import AreaPhysics
 
 AREA = """
 <mujoco>

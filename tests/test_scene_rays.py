@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mappo_unity.scenes.ray_sensor import RaySensor
-from mappo_unity.scenes.rays import (
+from mappo_unity.scenes.core.ray_sensor import RaySensor
+from mappo_unity.scenes.core.rays import (
     cast_boxes,
     cast_capsules,
     cast_rectangles,

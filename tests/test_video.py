@@ -13,7 +13,7 @@ from films import CAMERA, SIZE, frames_of, gif_durations_ms, where
 from mappo_unity.cli import play_main
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.render import Renderer
-from mappo_unity.scenes.drawings.shapes import BLUE, GREEN, RED, Camera, ball, box, capsule, yaw_rotation
+from mappo_unity.scenes.core.shapes import BLUE, GREEN, RED, Camera, ball, box, capsule, yaw_rotation
 from mappo_unity.video import VideoFile, check_video
 
 

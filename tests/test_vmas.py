@@ -13,7 +13,7 @@ import torch
 from mappo_unity.backend import make_env_function
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.scenes.check import check_env
+from mappo_unity.scenes.core.contract import check_env
 from mappo_unity.train import train
 
 pytest.importorskip("vmas", reason="needs the package vmas (extra 'bench')")

@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from mlagents_envs.base_env import BaseEnv
 
 SCENES = {
-    "3DBall": "ball3d:Ball3D",
-    "Basic": "basic:Basic",
-    "Walker": "walker:Walker",
-    "GridFoodCollector": "grid_food_collector:GridFoodCollector",
-    "SoccerTwos": "soccer:SoccerTwos",
-    "StrikersVsGoalie": "soccer:StrikersVsGoalie",
-    "DungeonEscape": "dungeon_escape:DungeonEscape",
-    "Hallway": "hallway:Hallway",
-    "WallJump": "wall_jump:WallJump",
-    "Pyramids": "pyramids:Pyramids",
+    "3DBall": "ball3d.scene:Ball3D",
+    "Basic": "basic.scene:Basic",
+    "Walker": "walker.scene:Walker",
+    "GridFoodCollector": "grid_food_collector.scene:GridFoodCollector",
+    "SoccerTwos": "soccer.scene:SoccerTwos",
+    "StrikersVsGoalie": "soccer.scene:StrikersVsGoalie",
+    "DungeonEscape": "dungeon_escape.scene:DungeonEscape",
+    "Hallway": "hallway.scene:Hallway",
+    "WallJump": "wall_jump.scene:WallJump",
+    "Pyramids": "pyramids.scene:Pyramids",
 }
 """Module and class of every scene, below this package."""
 

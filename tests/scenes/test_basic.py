@@ -7,8 +7,8 @@ import pytest
 from mlagents_envs.base_env import ActionTuple
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.basic import Basic
-from mappo_unity.scenes.check import check_env
+from mappo_unity.scenes.basic.scene import Basic
+from mappo_unity.scenes.core.contract import check_env
 
 NAME = "Basic?team=0"
 STAY, LEFT, RIGHT = 0, 1, 2

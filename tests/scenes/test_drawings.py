@@ -10,9 +10,7 @@ import pytest
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.policies import RandomPolicy
 from mappo_unity.scenes import make_scene, scene_names
-from mappo_unity.scenes.drawings import drawing_of
-from mappo_unity.scenes.drawings.grid_food_collector import FROZEN_COLOR
-from mappo_unity.scenes.drawings.shapes import (
+from mappo_unity.scenes.core.shapes import (
     GREEN,
     ORANGE,
     Kind,
@@ -21,6 +19,8 @@ from mappo_unity.scenes.drawings.shapes import (
     quaternion_rotation,
     yaw_rotation,
 )
+from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.scenes.grid_food_collector.drawing import FROZEN_COLOR
 
 
 def played(name: str, decisions: int = 3) -> Any:

@@ -13,9 +13,9 @@ import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.check import check_env
-from mappo_unity.scenes.dungeon_escape import DungeonEscape
-from mappo_unity.scenes.dungeon_layout import DRAGON, KEY, TOMB
+from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.dungeon_escape.layout import DRAGON, KEY, TOMB
+from mappo_unity.scenes.dungeon_escape.scene import DungeonEscape
 
 NAME = "DungeonEscape?team=0"
 NONE, FORWARD, BACKWARD, RIGHT, LEFT, STRAFE_LEFT, STRAFE_RIGHT = range(7)

@@ -9,8 +9,8 @@ import pytest
 from mlagents_envs.base_env import ActionTuple, DimensionProperty
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.check import check_env
-from mappo_unity.scenes.grid_food_collector import (
+from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.grid_food_collector.scene import (
     AGENT,
     BAD_FOOD,
     FOOD,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mappo_unity.scenes import ground
+from mappo_unity.scenes.core import ground
 
 CUBE = (0.5, 0.5, 0.5)
 

@@ -12,8 +12,8 @@ import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.check import check_env
-from mappo_unity.scenes.hallway import Hallway
+from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.hallway.scene import Hallway
 
 NAME = "Hallway?team=0"
 NONE, FORWARD, BACKWARD, RIGHT, LEFT = range(5)

@@ -10,11 +10,11 @@ from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.check import check_env
-from mappo_unity.scenes.pyramids import Pyramids
-from mappo_unity.scenes.pyramids_bodies import contact_point
-from mappo_unity.scenes.pyramids_bricks import ABSENT, ASLEEP, AWAKE, FALLING
-from mappo_unity.scenes.pyramids_layout import ZONES
+from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.pyramids.bodies import contact_point
+from mappo_unity.scenes.pyramids.bricks import ABSENT, ASLEEP, AWAKE, FALLING
+from mappo_unity.scenes.pyramids.layout import ZONES
+from mappo_unity.scenes.pyramids.scene import Pyramids
 
 NAME = "Pyramids?team=0"
 NONE, FORWARD, BACKWARD, RIGHT, LEFT = range(5)

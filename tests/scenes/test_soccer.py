@@ -17,8 +17,8 @@ from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.check import check_env
-from mappo_unity.scenes.soccer import SoccerScene
+from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.soccer.scene import SoccerScene
 
 PURPLE, BLUE = "SoccerTwos?team=1", "SoccerTwos?team=0"
 STRIKER, GOALIE = "Striker?team=0", "Goalie?team=1"

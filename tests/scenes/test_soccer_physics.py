@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mappo_unity.scenes.soccer_physics import BALL_RADIUS, SoccerPhysics
-from mappo_unity.scenes.soccer_pitch import CORNER_END, CORNER_OFFSET
+from mappo_unity.scenes.soccer.physics import BALL_RADIUS, SoccerPhysics
+from mappo_unity.scenes.soccer.pitch import CORNER_END, CORNER_OFFSET
 
 BALL, AGENT, OTHER = 0, 1, 2
 REACH = BALL_RADIUS + 0.5

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.rays import cast_rectangles, cast_spheres
-from mappo_unity.scenes.soccer import PURPLE, SoccerScene, SoccerTwos, StrikersVsGoalie
-from mappo_unity.scenes.soccer_casts import Walls, cast_discs, first_met, numbered, unmet_discs
+from mappo_unity.scenes.core.rays import cast_rectangles, cast_spheres
+from mappo_unity.scenes.soccer.casts import Walls, cast_discs, first_met, numbered, unmet_discs
+from mappo_unity.scenes.soccer.scene import PURPLE, SoccerScene, SoccerTwos, StrikersVsGoalie
 
 BALL_REACH = np.sqrt(1.1241719**2 - 0.25)  # 1.007: radii of ball and cast, centres 0.5 m apart in height
 AGENT_REACH = np.sqrt(0.75)

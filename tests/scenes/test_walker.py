@@ -20,9 +20,9 @@ from walker_figures import (
 
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes import walker_body as body
-from mappo_unity.scenes.check import check_env
-from mappo_unity.scenes.walker import Walker
+from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.walker import body
+from mappo_unity.scenes.walker.scene import Walker
 
 
 def test_a_tick_of_the_drives_is_the_implicit_step() -> None:

@@ -22,8 +22,8 @@ from walker_figures import (
 )
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes import walker_body as body
-from mappo_unity.scenes.walker import ACTION_ORDER, Walker, shortest_rotation
+from mappo_unity.scenes.walker import body
+from mappo_unity.scenes.walker.scene import ACTION_ORDER, Walker, shortest_rotation
 
 
 def test_spec_ids_and_groups() -> None:

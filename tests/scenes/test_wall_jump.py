@@ -10,8 +10,8 @@ import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.check import check_env
-from mappo_unity.scenes.wall_jump import NOTHING_PENDING, WallJump
+from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.wall_jump.scene import NOTHING_PENDING, WallJump
 
 SMALL, BIG = "SmallWallJump?team=0", "BigWallJump?team=0"
 FORWARD, LEFT_TURN, RIGHT_TURN, LEFT, RIGHT, JUMP = (1, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mappo_unity.scenes.wall_jump_bodies import WallJumpBodies
+from mappo_unity.scenes.wall_jump.bodies import WallJumpBodies
 
 GRAVITY = 2.75 * 9.81
 

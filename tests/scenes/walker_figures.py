@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import ActionTuple
 
-from mappo_unity.scenes import walker_body as body
-from mappo_unity.scenes.walker import Walker
+from mappo_unity.scenes.walker import body
+from mappo_unity.scenes.walker.scene import Walker
 
 NAME = "Walker?team=0"
 PARTS = (

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.scenes.drawings.shapes import Drawing
+from mappo_unity.scenes.core.shapes import Drawing
 
 DRAWINGS = {
     "3DBall": "ball3d",
@@ -22,14 +22,14 @@ DRAWINGS = {
     "SoccerTwos": "soccer",
     "StrikersVsGoalie": "soccer",
 }
-"""Module of every scene's drawing, below this package; each holds `DRAWING`."""
+"""Folder of every scene; its module `drawing` holds `DRAWING`."""
 
 
 def drawing_of(scene: str) -> Drawing:
     """Return the drawing of a scene; raises ConfigError where there is none."""
     if scene not in DRAWINGS:
         raise ConfigError(f"there is no drawing of a scene {scene!r}; choices: {', '.join(DRAWINGS)}")
-    module = importlib.import_module(f"{__name__}.{DRAWINGS[scene]}")
+    module = importlib.import_module(f"mappo_unity.scenes.{DRAWINGS[scene]}.drawing")
     drawing = module.DRAWING
     assert isinstance(drawing, Drawing)
     return drawing

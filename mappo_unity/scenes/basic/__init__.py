@@ -1,0 +1,1 @@
+"""The scene Basic: `scene` plays it, `drawing` says how it looks."""

@@ -1,0 +1,1 @@
+"""The scene DungeonEscape: `scene` plays it, `drawing` says how it looks."""

@@ -1,0 +1,1 @@
+"""The scene GridFoodCollector: `scene` plays it, `drawing` says how it looks."""

@@ -1,0 +1,1 @@
+"""The scene Hallway: `scene` plays it, `drawing` says how it looks."""

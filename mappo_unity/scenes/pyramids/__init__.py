@@ -1,0 +1,1 @@
+"""The scene Pyramids: `scene` plays it, `drawing` says how it looks."""

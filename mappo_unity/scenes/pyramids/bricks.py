@@ -1,0 +1,271 @@
+"""The brick pyramid of Pyramids: 25 cubes and the goal on top, which topple, on MuJoCo.
+
+In: where a pyramid appears, what surrounds it, how the agent moves. Out: the cubes' poses, the agent's motion
+among them, and whether it touches the goal. Knows no rewards or episodes.
+
+Each area's pile is in one of four modes: absent; falling, along a recording made once (a pile that falls
+untouched always falls alike); asleep, at rest; awake, stepped by MuJoCo together with its area's agent. It
+wakes when the agent or a turning switch may reach a cube, and sleeps when all cubes are at rest and out of
+reach. Only awake piles cost anything.
+Legend: N areas, B = 26 bodies (25 bricks, then the goal).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mappo_unity.scenes.core.ground import CONTACT_GAP, TICK_S
+from mappo_unity.scenes.core.physics import AreaPhysics
+from mappo_unity.scenes.pyramids.layout import (
+    BRICKS,
+    GOAL,
+    INNER_WALLS,
+    INSIDE_X,
+    INSIDE_Z,
+    SPAWN_Y,
+    STONE_LAYERS,
+)
+
+NUM_BODIES = len(BRICKS) + 1
+SUBSTEPS = 10  # of 2 ms in a tick: agents hit the cubes at up to 40 m/s
+ABSENT, FALLING, ASLEEP, AWAKE = range(4)
+HALVES = np.array([[0.5] * 3] * len(BRICKS) + [[1.0] * 3])
+RADII = np.sqrt((HALVES**2).sum(axis=1))
+AGENT_RADIUS = np.sqrt(0.75)
+SWITCH_RADIUS = np.sqrt(12.0)
+REST_SPEED = 0.05  # m/s and rad/s
+REST_TICKS = 25  # at rest for so long: asleep
+MAX_SPIN = 7.0  # rad/s: the engine's limit
+SPIN_KEPT = 1.0 - 0.05 * TICK_S
+FALL_TICKS = 150  # of the recording; the pile is at rest after about 100
+MARGIN = 0.1  # m
+_AGENT_JOINTS = 3  # along x and z, about y
+
+
+class PyramidsBricks:
+    """Keep the brick pyramids of all areas.
+
+    `mode` [N] (see the module's docstring), `clock` [N]: ticks of the fall, or ticks at rest while awake;
+    `root` [N, 2]: x, z where the pile appeared.
+    """
+
+    def __init__(self, num_areas: int, num_threads: int = 1) -> None:
+        self._physics = AreaPhysics(_area_spec(), num_areas, num_threads=num_threads)
+        start = _AGENT_JOINTS
+        self.bodies = self._physics.qpos[:, start:].reshape(num_areas, NUM_BODIES, 7)  # x y z, w x y z
+        self._speeds = self._physics.qvel[:, start:].reshape(num_areas, NUM_BODIES, 6)
+        self.mode = np.full(num_areas, ABSENT)
+        self.clock = np.zeros(num_areas, np.int64)
+        self.root = np.zeros((num_areas, 2))
+
+    @cached_property
+    def _fall(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the recording of a fall at the origin: poses [T, B, 7] and velocities [T, B, 6]."""
+        alone = AreaPhysics(_area_spec(), 1)
+        poses, speeds = [], []
+        alone.qpos[0, :2] = 40.0  # the agent, far away
+        alone.qpos[0, _AGENT_JOINTS:] = _spawned().ravel()
+        for _ in range(FALL_TICKS):
+            alone.step(SUBSTEPS)
+            poses.append(alone.qpos[0, _AGENT_JOINTS:].reshape(NUM_BODIES, 7).copy())
+            speeds.append(alone.qvel[0, _AGENT_JOINTS:].reshape(NUM_BODIES, 6).copy())
+        return np.array(poses), np.array(speeds)
+
+    def surround(self, areas: np.ndarray, stone_root: np.ndarray) -> None:
+        """Set x, z of the stone pyramids, [n, 6, 2]; they stand at rest by the time bricks come near."""
+        self._physics.mocap_pos[areas, 1:, ::2] = stone_root
+        self._physics.mocap_pos[areas, 1:, 1] = 0.0
+
+    def appear(self, areas: np.ndarray, root: np.ndarray) -> None:
+        """Let a pile appear above x, z `root` [n, 2] in `areas` [n]; it falls."""
+        self.bodies[areas] = _spawned()
+        self.bodies[areas, :, 0] += root[:, :1]
+        self.bodies[areas, :, 2] += root[:, 1:]
+        self._speeds[areas] = 0.0
+        self.root[areas] = root
+        self.clock[areas] = 0
+        self.mode[areas] = np.where(_clear_of_walls(root), FALLING, AWAKE)
+
+    def remove(self, areas: np.ndarray) -> None:
+        """Remove the piles of `areas` [n]."""
+        self.mode[areas] = ABSENT
+
+    @property
+    def present(self) -> np.ndarray:
+        """Return which areas have a pile, bool [N]."""
+        return self.mode != ABSENT
+
+    def wake(
+        self, position: np.ndarray, velocity: np.ndarray, switch_position: np.ndarray, switch_spin: np.ndarray
+    ) -> np.ndarray:
+        """Wake piles within reach of agents or turning switches; return who is awake, bool [N]."""
+        still = np.flatnonzero((self.mode == FALLING) | (self.mode == ASLEEP))
+        if still.size:
+            self.mode[still[self._in_reach(still, position, velocity, switch_position, switch_spin)]] = AWAKE
+        return self.mode == AWAKE
+
+    def step(
+        self,
+        position: np.ndarray,
+        velocity: np.ndarray,
+        yaw: np.ndarray,
+        switch: tuple[np.ndarray, np.ndarray],
+    ) -> np.ndarray:
+        """Advance by one tick; return which agents touch the goal, bool [N].
+
+        Agents of awake areas move: `position`, `velocity` [N, 3] change in place. `switch`: position [N, 3]
+        and yaw [N] of the switches.
+        """
+        self._replay()
+        goal = np.zeros(len(self.mode), bool)
+        areas = np.flatnonzero(self.mode == AWAKE)
+        if not areas.size:
+            return goal
+        physics = self._physics
+        physics.qpos[areas, 0], physics.qpos[areas, 1] = position[areas, 0], position[areas, 2]
+        physics.qpos[areas, 2] = yaw[areas]
+        physics.qvel[areas, 0], physics.qvel[areas, 1] = velocity[areas, 0], velocity[areas, 2]
+        physics.qvel[areas, 2] = 0.0
+        physics.mocap_pos[areas, 0] = switch[0][areas]
+        physics.mocap_quat[areas, 0, 0] = np.cos(0.5 * switch[1][areas])
+        physics.mocap_quat[areas, 0, 2] = np.sin(0.5 * switch[1][areas])
+        self._limit_spin(areas)
+        physics.step(SUBSTEPS, areas)
+        position[areas, 0], position[areas, 2] = physics.qpos[areas, 0], physics.qpos[areas, 1]
+        velocity[areas, 0], velocity[areas, 2] = physics.qvel[areas, 0], physics.qvel[areas, 1]
+        distance = physics.substep_sensors()[:, :, 0].min(axis=1)  # the goal may be thrown clear in the tick
+        goal[areas] = distance < CONTACT_GAP
+        self._rest(areas)
+        return goal
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the physics, modes and clocks."""
+        arrays = {"mode": self.mode.copy(), "clock": self.clock.copy(), "root": self.root.copy()}
+        return {"physics": self._physics.get_state(), **arrays}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_state` returned."""
+        self._physics.set_state(state["physics"])
+        self.mode[:], self.clock[:], self.root[:] = state["mode"], state["clock"], state["root"]
+
+    def _replay(self) -> None:
+        """Move falling piles along the recording; at its end they sleep."""
+        areas = np.flatnonzero(self.mode == FALLING)
+        if areas.size:
+            poses, speeds = self._fall
+            tick = self.clock[areas]
+            self.bodies[areas] = poses[tick]
+            self.bodies[areas, :, 0] += self.root[areas, :1]
+            self.bodies[areas, :, 2] += self.root[areas, 1:]
+            self._speeds[areas] = speeds[tick]
+            self.clock[areas] += 1
+            self._sleep(areas[tick + 1 == FALL_TICKS])
+
+    def _sleep(self, areas: np.ndarray) -> None:
+        self.mode[areas] = ASLEEP
+        self.clock[areas] = 0
+        self._speeds[areas] = 0.0
+
+    def _rest(self, areas: np.ndarray) -> None:
+        """Put piles to sleep that have been at rest for a while."""
+        moving = (np.abs(self._speeds[areas]) > REST_SPEED).any(axis=(1, 2))
+        self.clock[areas] = np.where(moving, 0, self.clock[areas] + 1)
+        self._sleep(areas[self.clock[areas] >= REST_TICKS])
+
+    def _in_reach(
+        self,
+        areas: np.ndarray,
+        position: np.ndarray,
+        velocity: np.ndarray,
+        switch_position: np.ndarray,
+        switch_spin: np.ndarray,
+    ) -> np.ndarray:
+        """Return in which of `areas` [n] an agent or a turning switch may touch a body within a tick."""
+        place = self.bodies[areas, :, :3]
+        speed = np.sqrt((velocity[areas] ** 2).sum(axis=1))
+        reach = RADII + (AGENT_RADIUS + MARGIN + speed * TICK_S)[:, None]
+        near = ((place - position[areas, None]) ** 2).sum(axis=2) < reach**2
+        turning = (switch_spin[areas] != 0)[:, None]
+        beside = ((place - switch_position[areas, None]) ** 2).sum(axis=2)
+        return (near | (turning & (beside < (RADII + SWITCH_RADIUS + MARGIN) ** 2))).any(axis=1)
+
+    def _limit_spin(self, areas: np.ndarray) -> None:
+        """Damp the bodies' spin and cap it, as the engine does at the start of a tick."""
+        spin = self._speeds[areas, :, 3:] * SPIN_KEPT
+        rate = np.sqrt((spin**2).sum(axis=2, keepdims=True))
+        self._speeds[areas, :, 3:] = spin * (MAX_SPIN / np.maximum(rate, MAX_SPIN))
+
+
+def _spawned() -> np.ndarray:
+    """Return the poses [B, 7] of a pile that appears above the origin."""
+    poses = np.zeros((NUM_BODIES, 7))
+    poses[:, :3] = np.vstack([BRICKS, GOAL]) + (0.0, SPAWN_Y, 0.0)
+    poses[:, 3] = 1.0
+    return poses
+
+
+def _clear_of_walls(root: np.ndarray) -> np.ndarray:
+    """Return bool [n]: whether piles above `root` [n, 2] touch no inner wall; others are not replayed."""
+    low, high = BRICKS[:, ::2].min(axis=0) - 0.5 - MARGIN, BRICKS[:, ::2].max(axis=0) + 0.5 + MARGIN
+    centre, half = root + 0.5 * (low + high), 0.5 * (high - low)
+    beside = np.abs(centre[:, None] - INNER_WALLS[:, [0, 2]])
+    return ~(beside < half + INNER_WALLS[:, [3, 5]]).all(axis=2).any(axis=1)
+
+
+def _area_spec() -> mujoco.MjSpec:
+    """Return the MuJoCo description of one area: still walls, switch and stones (mocap), agent, pile.
+
+    The agent slides without friction on the floor and meets only the pile: all its other contacts are
+    rules of `pyramids_bodies.py`. Its yaw is set, not pushed. The outer walls have no top, so that nothing
+    leaves the area.
+    """
+    walls = "".join(_box("", *wall) for wall in INNER_WALLS)
+    layers = "".join(_box("", x, rest_y, z, hx, hy, hz) for x, _, z, hx, hy, hz, rest_y in STONE_LAYERS)
+    stones = "".join(f'<body mocap="true" pos="0 -50 0">{layers}</body>' for i in range(6))
+    faces = (
+        (INSIDE_X[0], 0, "1 0 0"),
+        (INSIDE_X[1], 0, "-1 0 0"),
+        (0, INSIDE_Z[0], "0 0 1"),
+        (0, INSIDE_Z[1], "0 0 -1"),
+    )
+    planes = "".join(
+        f'<geom type="plane" size="0 0 1" pos="{x} 0 {z}" zaxis="{axis}" class="still"/>'
+        for x, z, axis in faces
+    )
+    cubes = "".join(
+        f'<body><freejoint/><geom class="loose" type="box" size="{h} {h} {h}" mass="2" name="{name}"/></body>'
+        for name, h in [*((f"brick{i}", 0.5) for i in range(len(BRICKS))), ("goal", 1.0)]
+    )
+    return mujoco.MjSpec.from_string(f"""
+<mujoco>
+  <option timestep="{TICK_S / SUBSTEPS}" gravity="0 -9.81 0" solver="Newton" cone="pyramidal"/>
+  <default>
+    <geom friction="0.6 0.005 0.0001" solref="0.01 2" solimp="0.95 0.99 0.001"/>
+    <default class="still"><geom contype="1" conaffinity="0"/></default>
+    <default class="loose"><geom contype="1" conaffinity="1"/></default>
+  </default>
+  <worldbody>
+    <geom type="plane" size="0 0 1" zaxis="0 1 0" class="still"/>
+    {planes}{walls}
+    <body name="switch" mocap="true" pos="0 -50 0">{_box("switch", 0, 0, 0, 2, 2, 2)}</body>
+    {stones}
+    <body name="agent" pos="0 0.5 0">
+      <joint type="slide" axis="1 0 0"/>
+      <joint type="slide" axis="0 0 1"/>
+      <joint type="hinge" axis="0 1 0" armature="1e6"/>
+      <geom name="agent" class="still" type="box" size="0.5 0.5 0.5" mass="25"/>
+    </body>
+    {cubes}
+  </worldbody>
+  <sensor><distance geom1="agent" geom2="goal" cutoff="1"/></sensor>
+</mujoco>
+""")
+
+
+def _box(name: str, x: float, y: float, z: float, half_x: float, half_y: float, half_z: float) -> str:
+    named = f'name="{name}" ' if name else ""
+    return f'<geom {named}class="still" type="box" pos="{x} {y} {z}" size="{half_x} {half_y} {half_z}"/>'

@@ -1,0 +1,61 @@
+"""How Pyramids looks: the arena with its walls, stone pyramids, the switch and the brick pyramid."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mappo_unity.scenes.core.shapes import (
+    BLUE,
+    FLOOR,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    WALL,
+    YELLOW,
+    Camera,
+    Drawing,
+    Shape,
+    agent_cube,
+    box,
+    quaternion_rotation,
+    yaw_rotation,
+)
+from mappo_unity.scenes.pyramids.bodies import AGENT_HALF, SWITCH_HALF
+from mappo_unity.scenes.pyramids.bricks import ABSENT, HALVES
+from mappo_unity.scenes.pyramids.layout import INNER_WALLS, LAYERS, OUTER_WALLS, STONES
+from mappo_unity.scenes.pyramids.scene import Pyramids
+
+AGENT_SHOWN = 2.0  # times as large as it is: an agent is a hundredth of the arena
+
+
+def shapes(scene: Pyramids, area: int) -> list[Shape]:
+    """Return arena, stones, the switch (red: off, green: on), bricks with the goal on top, and the agent."""
+    bodies, bricks = scene.bodies, scene.bricks
+    drawn = [box((0, -0.1, 0), (50.0, 0.1, 50.0), FLOOR)]
+    drawn += [_standing(wall, 1.5) for wall in OUTER_WALLS]
+    drawn += [_standing(wall, 4.52) for wall in INNER_WALLS]
+    heights = bodies.stone_heights(np.array([area]))[0]
+    for x, z in bodies.stone_root[area]:
+        for layer, height in zip(LAYERS, heights, strict=True):
+            drawn += [
+                box((x + cube[0], height, z + cube[2]), (0.5, 0.5, 0.5), GREY) for cube in STONES[layer]
+            ]
+    color = GREEN if scene.switch_on[area] else RED
+    turn = yaw_rotation(float(bodies.switch_yaw[area]))
+    drawn.append(box(bodies.switch_position[area], SWITCH_HALF, color, turn))
+    if bricks.mode[area] != ABSENT:
+        for number, pose in enumerate(bricks.bodies[area]):
+            color = YELLOW if number == len(HALVES) - 1 else ORANGE
+            drawn.append(box(pose[:3], HALVES[number], color, quaternion_rotation(pose[3:])))
+    half = AGENT_SHOWN * AGENT_HALF[0]
+    place = bodies.position[area] + [0, half - AGENT_HALF[1], 0]
+    return drawn + agent_cube(place, half, float(bodies.yaw[area]), BLUE)
+
+
+def _standing(wall: np.ndarray, top: float) -> Shape:
+    """Return the part of a wall [6] (centre, half sizes) from the floor up to `top`."""
+    return box((wall[0], top / 2, wall[2]), (wall[3], top / 2, wall[5]), WALL)
+
+
+DRAWING = Drawing(shapes, Camera((0.0, 0.0, -4.0), 148.0, yaw=0.0, pitch=52.0))

@@ -1,0 +1,1 @@
+"""The scene SoccerTwos and StrikersVsGoalie: `scene` plays it, `drawing` says how it looks."""

@@ -1,0 +1,1 @@
+"""The scene Walker: `scene` plays it, `drawing` says how it looks."""

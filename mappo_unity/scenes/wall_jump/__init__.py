@@ -1,0 +1,1 @@
+"""The scene WallJump: `scene` plays it, `drawing` says how it looks."""
