@@ -16,7 +16,7 @@ from traceback import TracebackException
 from typing import Any
 
 from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
-from mappo_unity.protobuf import install
+from mappo_unity.protocol.protobuf import install
 
 install()
 
@@ -64,9 +64,9 @@ def _embedded(cfg: EnvConfig) -> MakeEnv:
 
 
 def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
-    from mappo_unity.link.client import PlayerOptions, UnityPlayer
-    from mappo_unity.link.restarts import RestartingPlayer
-    from mappo_unity.link.several import SeveralPlayers
+    from mappo_unity.protocol.client import PlayerOptions, UnityPlayer
+    from mappo_unity.protocol.parallel_players import SeveralPlayers
+    from mappo_unity.protocol.restarting_player import RestartingPlayer
 
     executable = find_player(cfg)
     folder = _log_folder(cfg, log_folder)
@@ -111,12 +111,12 @@ def find_player(cfg: EnvConfig) -> Path | None:
     Raises:
         ConfigError: there is no such player or registry entry.
     """
-    from mappo_unity.link.process import find_executable
+    from mappo_unity.protocol.process import find_executable
 
     if cfg.backend is Backend.editor:
         return None
     if cfg.backend is Backend.registry:
-        from mappo_unity.link.registry import fetch_player
+        from mappo_unity.protocol.registry import fetch_player
 
         return fetch_player(cfg.registry, cfg.registry_entry or cfg.name)
     return find_executable(str(cfg.file_name))

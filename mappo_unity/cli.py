@@ -111,14 +111,14 @@ def _export_help() -> str:
 
 
 def _player_help() -> str:
-    from mappo_unity.player import help_text
+    from mappo_unity.protocol.serve import help_text
 
     return help_text()
 
 
 def _player_command(lines: list[str]) -> int:
     with interrupts_wait():
-        from mappo_unity.player import main
+        from mappo_unity.protocol.serve import main
 
     return main(lines)
 

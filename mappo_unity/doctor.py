@@ -143,8 +143,8 @@ def port_state(port: int) -> str:
 
 def examine_player(report: Report, options: argparse.Namespace) -> None:
     """Start or await a player and report all that can be learned from it."""
-    from mappo_unity.link.client import PlayerFailure, PlayerOptions, UnityPlayer
-    from mappo_unity.link.process import find_executable
+    from mappo_unity.protocol.client import PlayerFailure, PlayerOptions, UnityPlayer
+    from mappo_unity.protocol.process import find_executable
 
     executable = None
     if options.file_name:
@@ -206,7 +206,7 @@ def _examine_handshake(report: Report, player: Any) -> None:
         f"handshake after {time.perf_counter() - begin:.1f} s: {shake.name or 'unnamed'}, package "
         f"{shake.package_version or 'unknown'}, protocol {shake.communication_version}"
     )
-    from mappo_unity.link.messages import CAPABILITIES
+    from mappo_unity.protocol.messages import CAPABILITIES
 
     missing = [name for name in CAPABILITIES if not getattr(shake.capabilities, name)]
     if missing:

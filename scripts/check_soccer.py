@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-import mappo_unity.protobuf
+import mappo_unity.protocol.protobuf
 
-mappo_unity.protobuf.install()
+mappo_unity.protocol.protobuf.install()
 
 from mlagents_envs.base_env import ActionTuple  # noqa: E402
 

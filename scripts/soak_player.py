@@ -142,7 +142,7 @@ def report(run: Path, code: int, troubles: int) -> int:
 
 def serve(arguments: list[str]) -> int:
     """Serve 3DBall as a player that goes wrong on signals."""
-    from mappo_unity import player
+    from mappo_unity.protocol import serve as player
 
     wrong: set[str] = set()
 

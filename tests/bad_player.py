@@ -15,8 +15,8 @@ from collections.abc import Callable
 import grpc
 import numpy as np
 
-from mappo_unity.link import encode, messages
-from mappo_unity.player import Player, env_function
+from mappo_unity.protocol import encode, messages
+from mappo_unity.protocol.serve import Player, env_function
 from mappo_unity.scenes.ball3d.scene import Ball3D
 
 

@@ -12,7 +12,7 @@ import pytest
 
 for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
-os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")  # why: mappo_unity/link/__init__.py
+os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")  # why: mappo_unity/protocol/__init__.py
 
 
 @pytest.fixture(scope="session")

@@ -22,10 +22,10 @@ import pytest
 from mappo_unity.backend import PLAYER_STRIDE, make_env_function
 from mappo_unity.cli import train_main
 from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
-from mappo_unity.link.restarts import SEED_STRIDE, RestartingPlayer
-from mappo_unity.link.server import Link
-from mappo_unity.link.several import SeveralPlayers
-from mappo_unity.player import main as player_main
+from mappo_unity.protocol.parallel_players import SeveralPlayers
+from mappo_unity.protocol.restarting_player import SEED_STRIDE, RestartingPlayer
+from mappo_unity.protocol.serve import main as player_main
+from mappo_unity.protocol.server import Link
 from mappo_unity.scenes import make_scene
 
 from mlagents_envs.base_env import ActionTuple, BaseEnv  # isort: skip  # mappo_unity lets it import
@@ -136,7 +136,7 @@ class TestPlayer:
     def test_a_second_caller_is_turned_away(self) -> None:
         import grpc
 
-        from mappo_unity.link.messages import METHOD
+        from mappo_unity.protocol.messages import METHOD
 
         link = Link()
         try:
@@ -236,7 +236,7 @@ class TestFailures:
         env.close()
 
     def test_pauses_grow_with_failures_in_a_row(self) -> None:
-        from mappo_unity.link.restarts import _pause_s
+        from mappo_unity.protocol.restarting_player import _pause_s
 
         assert [_pause_s(n) for n in range(5)] == [0, 0.5, 1, 2, 4]
         assert _pause_s(50) == 10

@@ -14,9 +14,9 @@ from fakes import vector_spec
 
 from mappo_unity.cli import player_main
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.link import decode, encode, messages
-from mappo_unity.link.rows import varint_columns
-from mappo_unity.player import Player, env_function, main, play
+from mappo_unity.protocol import decode, encode, messages
+from mappo_unity.protocol.batch_encoding import varint_columns
+from mappo_unity.protocol.serve import Player, env_function, main, play
 from mappo_unity.scenes import make_scene, scene_names
 
 from mlagents_envs.base_env import (  # isort: skip  # mappo_unity lets it import
@@ -386,7 +386,9 @@ class TestCommand:
     def test_options_are_checked_before_the_trainer_is_called(
         self, arguments: list[str], words: str, monkeypatch: pytest.MonkeyPatch, capsys: Any
     ) -> None:
-        monkeypatch.setattr("mappo_unity.player.serve", lambda *_: pytest.fail("it called the trainer"))
+        monkeypatch.setattr(
+            "mappo_unity.protocol.serve.serve", lambda *_: pytest.fail("it called the trainer")
+        )
         assert player_main(arguments) == 2
         printed = capsys.readouterr().err
         assert words in printed and printed.count("\n") == 1
@@ -414,7 +416,7 @@ class TestCommand:
         assert "in a_factory" in lines[-1] and "player.py" not in lines[-1].replace(__file__, "")
 
     def test_whole_numbers_stay_whole(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("mappo_unity.player.serve", lambda *_: 0)
+        monkeypatch.setattr("mappo_unity.protocol.serve.serve", lambda *_: 0)
         assert main(["3DBall", "--param", "num_threads=2", "--param", "mass=2.5"]) == 0
         assert main(["test_player:a_factory", "--param", "size=3"]) == 0
 

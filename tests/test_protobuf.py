@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mappo_unity.protobuf import read_serialized_file
+from mappo_unity.protocol.protobuf import read_serialized_file
 
 
 def run_fresh(code: str) -> str:
@@ -28,7 +28,7 @@ def test_without_install_the_import_fails() -> None:
 
 def test_environment_imports_on_upb_beside_tensorboard() -> None:
     out = run_fresh("""
-from mappo_unity.protobuf import install
+from mappo_unity.protocol.protobuf import install
 install()
 from mlagents_envs.environment import UnityEnvironment
 from mlagents_envs.side_channel.engine_configuration_channel import EngineConfigurationChannel
@@ -43,7 +43,7 @@ print(api_implementation.Type(), UnityEnvironment.API_VERSION, type(UnityMessage
 def test_install_is_idempotent() -> None:
     out = run_fresh("""
 import sys
-from mappo_unity.protobuf import install
+from mappo_unity.protocol.protobuf import install
 install(); install()
 import mlagents_envs.environment
 install()
@@ -55,7 +55,7 @@ print([type(finder).__name__ for finder in sys.meta_path].count("_OldPb2Finder")
 def test_every_module_of_the_package_loads() -> None:
     out = run_fresh("""
 import importlib, pkgutil
-from mappo_unity.protobuf import install
+from mappo_unity.protocol.protobuf import install
 install()
 import mlagents_envs.communicator_objects as package
 names = sorted(info.name for info in pkgutil.iter_modules(package.__path__))
@@ -78,7 +78,7 @@ def test_unity_message_round_trip() -> None:
     """The wire bytes are worked out by hand from the .proto files (status = 1, id = 10)."""
     out = run_fresh("""
 import pickle
-from mappo_unity.protobuf import install
+from mappo_unity.protocol.protobuf import install
 install()
 from mlagents_envs.communicator_objects.agent_info_pb2 import AgentInfoProto
 from mlagents_envs.communicator_objects.observation_pb2 import NONE, ObservationProto

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import pytest
 
-from mappo_unity.player import main
+from mappo_unity.protocol.serve import main
 
 FOLDER = os.environ.get("MAPPO_WRAPPERS", "")
 CLIENT = r"""
 import json, os, sys, types
-from mappo_unity.protobuf import install
+from mappo_unity.protocol.protobuf import install
 install()
 import mlagents_envs
 # mlagents_envs.envs downloads a registry when it is imported; its modules alone do not

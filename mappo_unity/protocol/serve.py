@@ -17,7 +17,7 @@ from typing import Any, TextIO
 
 from mappo_unity.arguments import check_range
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.protobuf import install
+from mappo_unity.protocol.protobuf import install
 
 install()
 
@@ -26,9 +26,13 @@ import numpy as np  # noqa: E402
 from mlagents_envs.base_env import BaseEnv  # noqa: E402
 
 from mappo_unity import __version__  # noqa: E402
-from mappo_unity.link import encode, messages, side_channels  # noqa: E402
-from mappo_unity.link.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
-from mappo_unity.player_build import build  # noqa: E402
+from mappo_unity.protocol import (
+    encode,
+    messages,
+    side_channels,
+)
+from mappo_unity.protocol.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
+from mappo_unity.protocol.player_build import build  # noqa: E402
 
 EDITOR_PORT = 5004
 """Port on which a trainer waits for the Editor, used when no --mlagents-port is given."""

@@ -24,7 +24,7 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
         raise ConfigError(f"mappo-player build: unknown arguments {' '.join(rest)}")
     name = scene.rpartition(":")[2] or scene
     path = _executable(Path(folder), name)
-    command = [sys.executable, "-m", "mappo_unity.player", scene]
+    command = [sys.executable, "-m", "mappo_unity.protocol.serve", scene]
     if options.num_areas is not None:
         command += ["--num-areas", str(options.num_areas)]
     for parameter in options.param:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mappo_unity.link.messages import delimited, varint
+from mappo_unity.protocol.messages import delimited, varint
 
 VARINT_BYTES = 5  # holds any int32 >= 0
 _SHIFTS = np.arange(0, 7 * VARINT_BYTES, 7, dtype=np.int64)

@@ -16,7 +16,7 @@ from typing import Any
 import grpc
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.link.messages import METHOD, OPTIONS, STATUS_QUIT, message
+from mappo_unity.protocol.messages import METHOD, OPTIONS, STATUS_QUIT, message
 
 ADDRESS = "127.0.0.1"
 POLL_S = 0.1  # how often the player's process is looked at while nothing comes

@@ -12,7 +12,7 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 from mlagents_envs.exception import UnityActionException
 
-from mappo_unity.link.restarts import RestartingPlayer
+from mappo_unity.protocol.restarting_player import RestartingPlayer
 
 
 class SeveralPlayers(BaseEnv):

@@ -17,8 +17,8 @@ from mlagents_envs.base_env import (
     TerminalSteps,
 )
 
-from mappo_unity.link.messages import API_VERSION, CAPABILITIES, PNG, delimited, map_entry, varint
-from mappo_unity.link.rows import VARINT_BYTES, Layout, float_columns, packed_varints
+from mappo_unity.protocol.batch_encoding import VARINT_BYTES, Layout, float_columns, packed_varints
+from mappo_unity.protocol.messages import API_VERSION, CAPABILITIES, PNG, delimited, map_entry, varint
 
 
 class MalformedMessage(Exception):

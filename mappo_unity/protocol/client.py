@@ -24,11 +24,11 @@ from mlagents_envs.side_channel.environment_parameters_channel import Environmen
 from mlagents_envs.side_channel.side_channel_manager import SideChannelManager
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.link import decode, messages
-from mappo_unity.link.decode import ActionEncoder, BehaviorDecoder, MalformedMessage, behavior_spec
-from mappo_unity.link.messages import STATUS_OK
-from mappo_unity.link.process import PlayerProcess
-from mappo_unity.link.server import Link, LinkTimeout
+from mappo_unity.protocol import decode, messages
+from mappo_unity.protocol.decode import ActionEncoder, BehaviorDecoder, MalformedMessage, behavior_spec
+from mappo_unity.protocol.messages import STATUS_OK
+from mappo_unity.protocol.process import PlayerProcess
+from mappo_unity.protocol.server import Link, LinkTimeout
 
 NOBODY_ASKS = (
     "every Agent needs a DecisionRequester (or a call of RequestDecision), Behavior Type Default, and an "

@@ -14,20 +14,20 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, ObservationSpec, TerminalSteps
 from PIL import Image
 
-from mappo_unity.link.messages import (
+from mappo_unity.protocol.batch_encoding import (
+    VARINT_BYTES,
+    Layout,
+    float_columns,
+    joined_rows,
+    varint_columns,
+)
+from mappo_unity.protocol.messages import (
     API_VERSION,
     CAPABILITIES,
     PNG,
     delimited,
     map_entry,
     varint,
-)
-from mappo_unity.link.rows import (
-    VARINT_BYTES,
-    Layout,
-    float_columns,
-    joined_rows,
-    varint_columns,
 )
 
 

@@ -13,7 +13,7 @@ import importlib
 from functools import cache
 from typing import Any
 
-from mappo_unity.protobuf import PREFIX, install
+from mappo_unity.protocol.protobuf import PREFIX, install
 
 API_VERSION = "1.5.0"
 """Version of the protocol; peers must agree in the first number."""

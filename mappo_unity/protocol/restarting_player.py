@@ -15,7 +15,7 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 
 from mappo_unity.config.schema import ConfigError, EnvironmentFailure
-from mappo_unity.link.client import MakePlayer, PlayerFailure, UnityPlayer
+from mappo_unity.protocol.client import MakePlayer, PlayerFailure, UnityPlayer
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 """Pause before the second try in a row (before the first there is none), doubled with every further one."""

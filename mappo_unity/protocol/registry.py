@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.link.process import find_executable
+from mappo_unity.protocol.process import find_executable
 
 _URLS = {"darwin": "_darwin_url", "win32": "_win_url"}
 
