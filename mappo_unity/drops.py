@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from mappo_unity import keys
-from mappo_unity.unity_env import CutOff, UnityEnv
+from mappo_unity.envs.unity_env import CutOff, UnityEnv
 
 
 def drop_episodes(batch: TensorDictBase, cuts: Sequence[CutOff], env: UnityEnv) -> int:

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 
 from mappo_unity import checkpoint
-from mappo_unity.backend import make_env_function
 from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import ConfigError
+from mappo_unity.envs.backends import make_env_function
 from mappo_unity.episodes import play, summarize
 from mappo_unity.matches import Score, play_matches
 from mappo_unity.onnx_policy import SUFFIX, OnnxFolder, OnnxPolicy

@@ -11,8 +11,8 @@ from typing import Any
 
 from mappo_unity.checkpoint import CheckpointError
 from mappo_unity.config.schema import ModelConfig
+from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.policies import describe_spec
-from mappo_unity.unity_env import UnityEnv
 
 
 def describe_policies(env: UnityEnv) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from mappo_unity import keys
-from mappo_unity.rounds import Episode
+from mappo_unity.envs.rounds import Episode
 
 
 class EpisodeWindow:

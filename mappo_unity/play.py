@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 import torch
 
-from mappo_unity.backend import make_env_function
 from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import Backend, ConfigError, PlayConfig
+from mappo_unity.envs.backends import make_env_function
 from mappo_unity.evaluate import open_policy
 from mappo_unity.policies import Policy
 from mappo_unity.scenes.core.scene import Scene

@@ -31,6 +31,7 @@ from mappo_unity.config.overrides import shell_argument
 from mappo_unity.config.per_behavior import options_of
 from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.drops import drop_episodes
+from mappo_unity.envs.transforms import transformed
 from mappo_unity.export import RunExports, sample_inputs
 from mappo_unity.fit import check_fits, describe_models, describe_policies
 from mappo_unity.interrupts import handled
@@ -42,7 +43,6 @@ from mappo_unity.rng import get_rng_state, set_rng_state
 from mappo_unity.series import MatchSeries
 from mappo_unity.stopping import ECHO_S
 from mappo_unity.termination import Interrupted
-from mappo_unity.transforms import transformed
 
 PATIENCE_S = 5.0  # after a signal, before the iteration is given up
 DIVERGED = "diverged"  # status of a run most of whose updates were rolled back

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from mappo_unity.backend import make_env_function
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.envs.backends import make_env_function
 from mappo_unity.metrics import count_decisions
 from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.serve import Player, env_function
@@ -251,7 +251,7 @@ def decoding(data: bytes, steps: int) -> float:
 
 def policy(trainer: Trainer, steps: int) -> float:
     """Return what the policy costs a round, CPU us."""
-    from mappo_unity.transforms import transformed
+    from mappo_unity.envs.transforms import transformed
 
     observations = transformed(trainer.env).reset()
     with torch.no_grad():
@@ -260,8 +260,8 @@ def policy(trainer: Trainer, steps: int) -> float:
 
 def adapter(cfg: Config, arguments: argparse.Namespace) -> float:
     """Return what adapter and transforms add to a round, CPU us: embedded, less the scene's own steps."""
-    from mappo_unity.transforms import transformed
-    from mappo_unity.unity_env import UnityEnv
+    from mappo_unity.envs.transforms import transformed
+    from mappo_unity.envs.unity_env import UnityEnv
 
     make = env_function(arguments.scene, cfg.env.num_areas)
     env = UnityEnv(lambda seed: make(seed, None))

@@ -34,9 +34,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from mappo_unity.backend import MakeEnv, make_env_function
 from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import ConfigError
+from mappo_unity.envs.backends import MakeEnv, make_env_function
 from mappo_unity.episodes import play, standard_error
 from mappo_unity.evaluate import choose_checkpoint
 from mappo_unity.export import export_checkpoint

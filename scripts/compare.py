@@ -17,8 +17,8 @@ import statistics
 import tempfile
 from pathlib import Path
 
-from mappo_unity.backend import make_env_function
 from mappo_unity.config.compose import compose_config
+from mappo_unity.envs.backends import make_env_function
 from mappo_unity.evaluate import match_figures
 from mappo_unity.fit import describe_policies
 from mappo_unity.matches import play_matches

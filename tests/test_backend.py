@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mappo_unity.backend import PLAYER_STRIDE, make_env_function
 from mappo_unity.cli import train_main
 from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
+from mappo_unity.envs.backends import PLAYER_STRIDE, make_env_function
 from mappo_unity.protocol.parallel_players import SeveralPlayers
 from mappo_unity.protocol.restarting_player import SEED_STRIDE, RestartingPlayer
 from mappo_unity.protocol.serve import main as player_main
@@ -292,7 +292,7 @@ class TestFailures:
     def test_behaviors_that_never_appear_are_missed(
         self, bad: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        from mappo_unity import unity_env
+        from mappo_unity.envs import unity_env
 
         monkeypatch.setattr(unity_env, "MAX_SILENT_STEPS", 50)
         with pytest.raises(ConfigError, match="no behavior with an agent that asks"):
@@ -304,7 +304,7 @@ class TestEnds:
 
     SCRIPT = """
 import sys, time
-from mappo_unity.backend import make_env_function
+from mappo_unity.envs.backends import make_env_function
 from mappo_unity.config.schema import Backend, EnvConfig
 env = make_env_function(EnvConfig(
     backend=Backend.player, file_name=sys.argv[1], player_logs=sys.argv[2], timeout_s=60, num_players=2))(0)

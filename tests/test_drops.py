@@ -16,10 +16,10 @@ from mappo_unity.cli import train_main
 from mappo_unity.collect import make_collector
 from mappo_unity.config.schema import ConfigError, EnvironmentFailure
 from mappo_unity.drops import drop_episodes, episode_rows
+from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.episodes import play
 from mappo_unity.policies import RandomPolicy
 from mappo_unity.scenes import make_scene
-from mappo_unity.unity_env import UnityEnv
 
 FAKE = "Fake?team=0"
 
@@ -113,7 +113,7 @@ def test_an_environment_without_players_has_no_restarts() -> None:
 
 def test_drops_reach_batches_of_the_collector() -> None:
     """The collector's batch is changed in place, whatever way it is stored."""
-    from mappo_unity.transforms import transformed
+    from mappo_unity.envs.transforms import transformed
 
     env = fragile([[Record(0, reward=1), Record(1, reward=1)]] * 12, 99, ())
     collector = make_collector(transformed(env), None, 5)  # type: ignore[arg-type]

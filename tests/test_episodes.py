@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from mappo_unity.envs.rounds import Episode
 from mappo_unity.episodes import standard_error, summarize
-from mappo_unity.rounds import Episode
 
 
 def test_episodes_of_agents_alone_have_the_textbook_s_standard_error():

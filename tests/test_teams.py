@@ -12,9 +12,9 @@ from mappo_unity.config.per_behavior import check_behaviors, options_of
 from mappo_unity.config.schema import Config, ConfigError, CriticKind, ModelConfig
 from mappo_unity.critics import CentralCritic, PooledCritic
 from mappo_unity.encoders import Encoder, ObsLayout
+from mappo_unity.envs.transforms import transformed
+from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.scenes import make_scene
-from mappo_unity.transforms import transformed
-from mappo_unity.unity_env import UnityEnv
 
 
 def soccer(areas=2):

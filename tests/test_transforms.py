@@ -12,10 +12,10 @@ from mappo_unity.actions import ActionLayout
 from mappo_unity.collect import make_collector
 from mappo_unity.config.schema import ModelConfig
 from mappo_unity.encoders import ObsLayout
+from mappo_unity.envs.transforms import make_transforms, transformed
+from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.models import JointPolicy, make_actor
 from mappo_unity.scenes import make_scene
-from mappo_unity.transforms import make_transforms, transformed
-from mappo_unity.unity_env import UnityEnv
 
 END, CUT = "terminated", "interrupted"
 

@@ -9,9 +9,9 @@ from mlagents_envs.base_env import ActionSpec
 from torchrl.envs.utils import check_env_specs
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.rounds import EnvironmentDataError
+from mappo_unity.envs.rounds import EnvironmentDataError
+from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.scenes import make_scene
-from mappo_unity.unity_env import UnityEnv
 
 END, CUT = "terminated", "interrupted"
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from mappo_unity.backend import make_env_function
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import ConfigError
+from mappo_unity.envs.backends import make_env_function
 from mappo_unity.scenes.core.contract import check_env
 from mappo_unity.train import train
 

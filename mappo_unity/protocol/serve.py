@@ -94,7 +94,7 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
     if "seed" in fixed:
         raise ConfigError("--param seed: the seed is the trainer's to choose")
     if ":" in scene:
-        from mappo_unity.backend import call_factory, check_call, load_factory
+        from mappo_unity.envs.backends import call_factory, check_call, load_factory
 
         factory = load_factory(scene, scene)
         check_call(factory, scene, fixed)

@@ -12,7 +12,7 @@ import torch
 from torchrl.data import Binary, Bounded, Composite, MultiCategorical, Unbounded
 
 from mappo_unity import keys
-from mappo_unity.rounds import BehaviorRounds
+from mappo_unity.envs.rounds import BehaviorRounds
 
 
 def make_specs(

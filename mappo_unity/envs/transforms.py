@@ -12,7 +12,7 @@ from torchrl.envs import CatTensors, Compose, ExcludeTransform, Stack, Transform
 
 from mappo_unity import keys
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.unity_env import UnityEnv, unchecked
+from mappo_unity.envs.unity_env import UnityEnv, unchecked
 
 
 def make_transforms(env: UnityEnv) -> Compose:

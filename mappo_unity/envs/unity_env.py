@@ -23,9 +23,9 @@ from torchrl.envs import EnvBase
 
 from mappo_unity import keys
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.rounds import BehaviorRounds, Episode
-from mappo_unity.slots import SlotTable, count_teams
-from mappo_unity.specs import make_specs
+from mappo_unity.envs.rounds import BehaviorRounds, Episode
+from mappo_unity.envs.slots import SlotTable, count_teams
+from mappo_unity.envs.specs import make_specs
 
 MAX_SILENT_STEPS = 100_000  # BaseEnv steps in which nobody asks before that is called an error
 

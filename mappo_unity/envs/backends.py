@@ -22,7 +22,7 @@ install()
 
 from mlagents_envs.base_env import BaseEnv  # noqa: E402
 
-from mappo_unity.user_env import GuardedEnv  # noqa: E402
+from mappo_unity.envs.user_env import GuardedEnv  # noqa: E402
 
 MakeEnv = Callable[[int], BaseEnv]
 
@@ -30,7 +30,11 @@ EDITOR_PORT = 5004
 """Port on which Unity's Editor looks for a trainer."""
 PLAYER_STRIDE = 100_003
 """Player n of several starts from the seed plus n times this (modulo 2^31)."""
-OUR_FRAMES = ("<frozen importlib", str(Path(inspect.getfile(importlib)).parent), str(Path(__file__).parent))
+OUR_FRAMES = (
+    "<frozen importlib",
+    str(Path(inspect.getfile(importlib)).parent),
+    str(Path(__file__).parents[1]),
+)
 """Beginnings of file names in a traceback that say nothing about a user's code."""
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.slots import SlotTable
+from mappo_unity.envs.slots import SlotTable
 
 
 class EnvironmentDataError(ConfigError):
