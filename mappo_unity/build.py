@@ -11,16 +11,16 @@ from pathlib import Path
 
 import torch
 
-from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.collect import num_rounds
 from mappo_unity.config.per_behavior import check_behaviors, options_of
 from mappo_unity.config.schema import Config, ConfigError, ModelConfig
-from mappo_unity.encoders import ObsLayout
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.learning.actor_critic import make_actor, make_critic
+from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
+from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.memory import check_free, show_size
-from mappo_unity.models import make_actor, make_critic
-from mappo_unity.ppo import PolicyLearner
 from mappo_unity.rng import seed_everything
 from mappo_unity.runs import PLAYERS
 

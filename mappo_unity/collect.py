@@ -9,7 +9,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType
 
 from mappo_unity.config.schema import CollectConfig
-from mappo_unity.models import JointPolicy
+from mappo_unity.learning.actor_critic import JointPolicy
 
 
 def num_rounds(cfg: CollectConfig, agents: int) -> int:

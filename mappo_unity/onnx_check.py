@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from mappo_unity import keys
-from mappo_unity.actions import CONTINUOUS_LIMIT, ActionDistribution
+from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionDistribution
 from mappo_unity.onnx_graph import ExportError
 from mappo_unity.onnx_policy import fit_image, open_session
 

@@ -24,10 +24,10 @@ import numpy as np
 from torch import Tensor, nn
 
 from mappo_unity import __version__
-from mappo_unity.actions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.encoders import OBS_CLIP, Encoder
-from mappo_unity.models import LOG_STD_RANGE, Actor, PerMember
+from mappo_unity.learning.actor_critic import LOG_STD_RANGE, Actor, PerMember
+from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
+from mappo_unity.learning.encoders import OBS_CLIP, Encoder
 
 FORMAT = 3.0  # ML-Agents' ModelApiVersion.MLAgents2_0: an input for each sensor, actions drawn in the graph
 OPSET, IR_VERSION = 9, 4  # those of the files that ML-Agents writes

@@ -35,10 +35,10 @@ from mappo_unity.envs.transforms import transformed
 from mappo_unity.export import RunExports, sample_inputs
 from mappo_unity.fit import check_fits, describe_models, describe_policies
 from mappo_unity.interrupts import handled
+from mappo_unity.learning.actor_critic import JointPolicy
 from mappo_unity.log import RunLog, check_backends
 from mappo_unity.memory import is_out_of_memory
 from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
-from mappo_unity.models import JointPolicy
 from mappo_unity.rng import get_rng_state, set_rng_state
 from mappo_unity.series import MatchSeries
 from mappo_unity.stopping import ECHO_S

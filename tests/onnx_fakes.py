@@ -9,10 +9,10 @@ from types import ModuleType
 import numpy as np
 import torch
 
-from mappo_unity.actions import ActionLayout
 from mappo_unity.config.schema import ModelConfig
-from mappo_unity.encoders import ObsLayout
-from mappo_unity.models import make_actor
+from mappo_unity.learning.actor_critic import make_actor
+from mappo_unity.learning.distributions import ActionLayout
+from mappo_unity.learning.encoders import ObsLayout
 from mappo_unity.onnx_graph import build_model
 
 

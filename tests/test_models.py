@@ -8,11 +8,11 @@ from tensordict import TensorDict
 from torch.distributions import Categorical, Normal
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from mappo_unity.actions import ActionDistribution, ActionLayout
 from mappo_unity.config.schema import ModelConfig
-from mappo_unity.encoders import ObsLayout, RunningNorm
-from mappo_unity.models import Actor, JointPolicy, make_actor
-from mappo_unity.value_norm import ValueNorm
+from mappo_unity.learning.actor_critic import Actor, JointPolicy, make_actor
+from mappo_unity.learning.distributions import ActionDistribution, ActionLayout
+from mappo_unity.learning.encoders import ObsLayout, RunningNorm
+from mappo_unity.learning.value_norm import ValueNorm
 
 
 def test_hybrid_log_prob_and_entropy_are_the_sums_of_torchs_own():

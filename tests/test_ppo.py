@@ -7,11 +7,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from mappo_unity.actions import ActionLayout
 from mappo_unity.config.schema import Activation, ModelConfig, PPOConfig, Schedule, ValueLoss, ValueNormKind
-from mappo_unity.encoders import ObsLayout
-from mappo_unity.models import make_actor, make_critic
-from mappo_unity.ppo import LEARNS, PolicyLearner
+from mappo_unity.learning.actor_critic import make_actor, make_critic
+from mappo_unity.learning.distributions import ActionLayout
+from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.learning.ppo import LEARNS, PolicyLearner
 
 T, G, A, OBS = 12, 5, 2, 3
 TWO_CONTINUOUS = ActionLayout(2, ())

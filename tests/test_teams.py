@@ -7,13 +7,13 @@ from fakes import ScriptedEnv, behavior_spec
 from mlagents_envs.base_env import ActionSpec
 from torchrl.envs.utils import check_env_specs
 
-from mappo_unity.actions import ActionDistribution, ActionLayout
 from mappo_unity.config.per_behavior import check_behaviors, options_of
 from mappo_unity.config.schema import Config, ConfigError, CriticKind, ModelConfig
-from mappo_unity.critics import CentralCritic, PooledCritic
-from mappo_unity.encoders import Encoder, ObsLayout
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.learning.critics import CentralCritic, PooledCritic
+from mappo_unity.learning.distributions import ActionDistribution, ActionLayout
+from mappo_unity.learning.encoders import Encoder, ObsLayout
 from mappo_unity.scenes import make_scene
 
 

@@ -8,13 +8,13 @@ from mlagents_envs.base_env import ActionSpec
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.modules import ProbabilisticActor
 
-from mappo_unity.actions import ActionLayout
 from mappo_unity.collect import make_collector
 from mappo_unity.config.schema import ModelConfig
-from mappo_unity.encoders import ObsLayout
 from mappo_unity.envs.transforms import make_transforms, transformed
 from mappo_unity.envs.unity_env import UnityEnv
-from mappo_unity.models import JointPolicy, make_actor
+from mappo_unity.learning.actor_critic import JointPolicy, make_actor
+from mappo_unity.learning.distributions import ActionLayout
+from mappo_unity.learning.encoders import ObsLayout
 from mappo_unity.scenes import make_scene
 
 END, CUT = "terminated", "interrupted"

@@ -22,10 +22,10 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
 from mappo_unity import keys
-from mappo_unity.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
 from mappo_unity.config.schema import Optimizer, PPOConfig, ValueLoss, ValueNormKind
-from mappo_unity.encoders import RunningNorm
-from mappo_unity.value_norm import ValueNorm
+from mappo_unity.learning.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
+from mappo_unity.learning.encoders import RunningNorm
+from mappo_unity.learning.value_norm import ValueNorm
 
 LEARNS = "learns"  # bool [rows, A, 1]: the slot acted and the outcome is known
 VALUED = "valued"  # bool [rows, A, 1]: the same, or its agent departed while a team mate acted

@@ -16,11 +16,11 @@ from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
-from mappo_unity.actions import ActionDistribution, ActionLayout
 from mappo_unity.config.schema import CriticKind, ModelConfig
-from mappo_unity.critics import CentralCritic, LocalCritic, PooledCritic
-from mappo_unity.encoders import Encoder, ObsLayout
-from mappo_unity.layers import make_mlp
+from mappo_unity.learning.critics import CentralCritic, LocalCritic, PooledCritic
+from mappo_unity.learning.distributions import ActionDistribution, ActionLayout
+from mappo_unity.learning.encoders import Encoder, ObsLayout
+from mappo_unity.learning.mlp import make_mlp
 
 LOG_STD_RANGE = (-5.0, 2.0)
 
