@@ -21,8 +21,8 @@ from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.memory import check_free, show_size
-from mappo_unity.rng import seed_everything
-from mappo_unity.runs import PLAYERS
+from mappo_unity.runs.folder import PLAYERS
+from mappo_unity.runs.rng import seed_everything
 
 BATCH_COPIES = 6
 """Memory of a batch in units of its observations: as they were and as next ones, as rounds and as a stack of

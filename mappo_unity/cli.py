@@ -149,9 +149,9 @@ def _train_command(lines: list[str]) -> int:
 
 def _train_anew(lines: list[str]) -> int:
     with interrupts_wait():
-        from mappo_unity import runs
         from mappo_unity.config.compose import check_effect, check_factory, compose_config
         from mappo_unity.config.overrides import given
+        from mappo_unity.runs import folder as runs
 
         composed = compose_config(lines)
         check_effect(lines, [composed.config])
@@ -168,8 +168,8 @@ def _train_anew(lines: list[str]) -> int:
 
 def _train_on(lines: list[str], path: Path) -> int:
     with interrupts_wait():
-        from mappo_unity import runs
         from mappo_unity.config.compose import check_factory, compose_resumed
+        from mappo_unity.runs import folder as runs
 
         folder = runs.find_run(path, "resume")
         config = compose_resumed(lines, folder / runs.CONFIG)
@@ -180,7 +180,7 @@ def _train_on(lines: list[str], path: Path) -> int:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    from mappo_unity.run_lock import locked
+    from mappo_unity.runs.lock import locked
 
     with locked(folder) as warning:
         if warning is not None:
@@ -189,8 +189,8 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _train_locked(config: Config, folder: Path, source: Path, lines: list[str]) -> int:
-    from mappo_unity import runs
-    from mappo_unity.checkpoint import newest_good
+    from mappo_unity.runs import folder as runs
+    from mappo_unity.runs.checkpoint import newest_good
 
     checkpoint, warnings = newest_good(source)
     for warning in warnings:
@@ -281,7 +281,7 @@ def _play_command(lines: list[str]) -> int:
 
 def _export_command(lines: list[str]) -> int:
     from mappo_unity.config.compose import compose_plain
-    from mappo_unity.runs import find_run
+    from mappo_unity.runs.folder import find_run
 
     options = compose_plain(lines, ExportConfig)
     run = Path(options.run)

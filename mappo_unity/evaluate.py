@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 
-from mappo_unity import checkpoint
 from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.backends import make_env_function
@@ -18,6 +17,7 @@ from mappo_unity.episodes import play, summarize
 from mappo_unity.matches import Score, play_matches
 from mappo_unity.onnx_policy import SUFFIX, OnnxFolder, OnnxPolicy
 from mappo_unity.policies import CheckpointPolicy, Policy, RandomPolicy
+from mappo_unity.runs import checkpoint
 
 
 def evaluate(

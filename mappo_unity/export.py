@@ -17,12 +17,13 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from mappo_unity import checkpoint, keys
-from mappo_unity.atomic import write_atomically
+from mappo_unity import keys
 from mappo_unity.onnx_check import compare
 from mappo_unity.onnx_graph import ExportError, build_model
 from mappo_unity.onnx_policy import SUFFIX, file_name
 from mappo_unity.policies import CheckpointPolicy
+from mappo_unity.runs import checkpoint
+from mappo_unity.runs.atomic import write_atomically
 
 SAMPLE_ROWS = 64  # observations that a checkpoint keeps of each policy
 PAUSE_S = 10.0  # least time between two exports of the best checkpoint of a run

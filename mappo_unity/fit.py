@@ -9,10 +9,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.checkpoint import CheckpointError
 from mappo_unity.config.schema import ModelConfig
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.policies import describe_spec
+from mappo_unity.runs.checkpoint import CheckpointError
 
 
 def describe_policies(env: UnityEnv) -> dict[str, Any]:

@@ -15,11 +15,12 @@ from mlagents_envs.base_env import ActionSpec, ActionTuple, BehaviorSpec, Decisi
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from mappo_unity import checkpoint, keys
+from mappo_unity import keys
 from mappo_unity.config.schema import Activation, ConfigError, CriticKind, ModelConfig
 from mappo_unity.learning.actor_critic import make_actor
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.runs import checkpoint
 
 
 class Policy(Protocol):

@@ -16,7 +16,7 @@ from mappo_unity.envs.backends import make_env_function
 from mappo_unity.learning.actor_critic import UnityActor
 from mappo_unity.matches import Score, play_matches, sides_of
 from mappo_unity.policies import ActorPolicy, RandomPolicy
-from mappo_unity.runs import PLAYERS
+from mappo_unity.runs.folder import PLAYERS
 
 
 class MatchSeries:

@@ -23,15 +23,15 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from mappo_unity.atomic import write_atomically
 from mappo_unity.config.behavior_lines import dotted_options, readable_lines
 from mappo_unity.config.compose import Composed, check_effect, check_factory, compose_config, to_config
 from mappo_unity.config.overrides import check_overrides, given, open_line, parse, quoted
 from mappo_unity.config.presets import conf_dir, group_choices
 from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.interrupts import interrupts_wait
-from mappo_unity.run_lock import locked
-from mappo_unity.runs import NewFolder, create_folder, discard_folder, write_record
+from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.folder import NewFolder, create_folder, discard_folder, write_record
+from mappo_unity.runs.lock import locked
 from mappo_unity.stopping import Patience, job_signals, sweep_signals
 from mappo_unity.termination import Interrupted
 

@@ -24,7 +24,6 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
-from mappo_unity import checkpoint
 from mappo_unity.build import batch_rounds, make_learners, make_unity_env, prepare_torch
 from mappo_unity.collect import make_collector
 from mappo_unity.config.overrides import shell_argument
@@ -36,10 +35,11 @@ from mappo_unity.export import RunExports, sample_inputs
 from mappo_unity.fit import check_fits, describe_models, describe_policies
 from mappo_unity.interrupts import handled
 from mappo_unity.learning.actor_critic import JointPolicy
-from mappo_unity.log import RunLog, check_backends
 from mappo_unity.memory import is_out_of_memory
 from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
-from mappo_unity.rng import get_rng_state, set_rng_state
+from mappo_unity.runs import checkpoint
+from mappo_unity.runs.logger import RunLog, check_backends
+from mappo_unity.runs.rng import get_rng_state, set_rng_state
 from mappo_unity.series import MatchSeries
 from mappo_unity.stopping import ECHO_S
 from mappo_unity.termination import Interrupted

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from mappo_unity import checkpoint
-from mappo_unity.checkpoint import CheckpointError, load, newest_good, save, save_in, to_arrays
+from mappo_unity.runs import checkpoint
+from mappo_unity.runs.checkpoint import CheckpointError, load, newest_good, save, save_in, to_arrays
 
 STATE = {
     "weights": {"a": torch.arange(1000.0)},

@@ -19,17 +19,18 @@ import pytest
 import yaml
 from fake_training import Outcome
 
-from mappo_unity import __version__, run_lock
+from mappo_unity import __version__
 from mappo_unity.cli import eval_main, train_main
 from mappo_unity.config.option_table import option_table
 from mappo_unity.config.presets import all_groups, describe_choices
 from mappo_unity.config.schema import Config, ConfigError, EvalConfig
-from mappo_unity.run_lock import locked
-from mappo_unity.runs import create_folder, find_run, read_versions
+from mappo_unity.runs import lock as run_lock
+from mappo_unity.runs.folder import create_folder, find_run, read_versions
+from mappo_unity.runs.lock import locked
 
 
 class FakeTraining:
-    """Stand in for mappo_unity.train and mappo_unity.checkpoint; keep the calls."""
+    """Stand in for mappo_unity.train and mappo_unity.runs.checkpoint; keep the calls."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[Config, Path, Path | None]] = []
@@ -323,7 +324,7 @@ def test_a_run_in_training_takes_no_second_one(
     train_main(["hydra.run.dir=mine"])
     before = {path.name: path.read_bytes() for path in Path("mine").iterdir()}
     code = (
-        "from pathlib import Path; from mappo_unity.run_lock import locked\n"
+        "from pathlib import Path; from mappo_unity.runs.lock import locked\n"
         "with locked(Path('mine')): print('locked', flush=True); input()"
     )
     root = str(Path(__file__).resolve().parents[1])

@@ -24,7 +24,7 @@ from mappo_unity.config.overrides import given, shell_argument
 from mappo_unity.config.per_behavior import options_of
 from mappo_unity.config.presets import conf_dir
 from mappo_unity.config.schema import Activation, Config, ConfigError, EvalConfig, LogBackend
-from mappo_unity.runs import CONFIG, write_record
+from mappo_unity.runs.folder import CONFIG, write_record
 
 FILES = sorted(path.relative_to(conf_dir()).as_posix() for path in conf_dir().rglob("*.yaml"))
 FACTORY = "env.factory=test_compose:make_nothing"

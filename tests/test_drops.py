@@ -11,7 +11,6 @@ import pytest
 import torch
 from fakes import Record, ScriptedEnv, behavior_spec
 
-from mappo_unity import checkpoint
 from mappo_unity.cli import train_main
 from mappo_unity.collect import make_collector
 from mappo_unity.config.schema import ConfigError, EnvironmentFailure
@@ -19,6 +18,7 @@ from mappo_unity.drops import drop_episodes, episode_rows
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.episodes import play
 from mappo_unity.policies import RandomPolicy
+from mappo_unity.runs import checkpoint
 from mappo_unity.scenes import make_scene
 
 FAKE = "Fake?team=0"

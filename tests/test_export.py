@@ -11,7 +11,7 @@ import torch
 from onnx_fakes import official_policy, run_policy
 from tensordict import TensorDict
 
-from mappo_unity import checkpoint, export
+from mappo_unity import export
 from mappo_unity.cli import eval_main, export_main
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import CollectConfig, Config, EnvConfig, LogConfig, ModelConfig, PPOConfig
@@ -20,7 +20,8 @@ from mappo_unity.export import RunExports, export_checkpoint, sample_inputs
 from mappo_unity.onnx_graph import ExportError
 from mappo_unity.onnx_policy import OnnxPolicy
 from mappo_unity.policies import CheckpointPolicy
-from mappo_unity.runs import write_record
+from mappo_unity.runs import checkpoint
+from mappo_unity.runs.folder import write_record
 from mappo_unity.scenes import make_scene
 from mappo_unity.train import Trainer, train
 
@@ -135,7 +136,7 @@ def test_a_failed_export_is_one_line_and_ends_no_run(tmp_path, monkeypatch):
 
     monkeypatch.setattr(export, "export_checkpoint", fail)
     messages = []
-    monkeypatch.setattr("mappo_unity.log.RunLog.message", lambda self, text: messages.append(text))
+    monkeypatch.setattr("mappo_unity.runs.logger.RunLog.message", lambda self, text: messages.append(text))
     trainer = Trainer(options(3), tmp_path)
     outcome = trainer.run()
     trainer.close()
@@ -187,7 +188,7 @@ def test_a_file_is_written_whole_or_not_at_all(tiny_run, tmp_path, monkeypatch):
     target = tmp_path / "policy.onnx"
     target.write_bytes(b"old")
     monkeypatch.setattr(
-        "mappo_unity.atomic.os.replace", lambda a, b: (_ for _ in ()).throw(OSError(28, "full"))
+        "mappo_unity.runs.atomic.os.replace", lambda a, b: (_ for _ in ()).throw(OSError(28, "full"))
     )
     with pytest.raises(ExportError, match="cannot be written: full"):
         export_checkpoint(tiny_run / "checkpoints" / "best.pt", target)

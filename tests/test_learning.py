@@ -6,7 +6,7 @@ import pytest
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.evaluate import evaluate
-from mappo_unity.runs import write_record
+from mappo_unity.runs.folder import write_record
 from mappo_unity.train import train
 
 

@@ -19,9 +19,9 @@ import pytest
 from rich.console import Console
 
 from mappo_unity.config.schema import ConfigError, LogBackend, LogConfig
-from mappo_unity.log import RunLog, read_metrics
-from mappo_unity.metrics_file import MetricsFile, keep_until
-from mappo_unity.progress import Progress, describe
+from mappo_unity.runs.logger import RunLog, read_metrics
+from mappo_unity.runs.metrics_csv import MetricsFile, keep_until
+from mappo_unity.runs.progress import Progress, describe
 
 NAN = math.nan
 TENSORBOARD = LogConfig(backends=[LogBackend.tensorboard], progress=False)
@@ -313,7 +313,7 @@ def test_killed_writer_loses_no_row(tmp_path: Path) -> None:
 import os, signal
 from pathlib import Path
 from mappo_unity.config.schema import LogBackend, LogConfig
-from mappo_unity.log import RunLog
+from mappo_unity.runs.logger import RunLog
 log = RunLog(LogConfig(backends=[LogBackend.tensorboard], progress=False), Path({str(tmp_path)!r}), 1000)
 for i in range(1, 6):
     log.log({{"iteration": i, "agent_steps": 100 * i, "x": i / 2}})
@@ -368,7 +368,7 @@ def test_mlflow_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_importing_the_log_leaves_torch_alone() -> None:
-    code = "import sys, mappo_unity.log; print('torch' in sys.modules, 'tensorboard' in sys.modules)"
+    code = "import sys, mappo_unity.runs.logger; print('torch' in sys.modules, 'tensorboard' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.split() == ["False", "False"], done.stderr
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from films import CAMERA, SIZE, frames_of
 
-from mappo_unity import runs
 from mappo_unity.cli import play_main
 from mappo_unity.config.schema import (
     CollectConfig,
@@ -24,6 +23,7 @@ from mappo_unity.config.schema import (
 )
 from mappo_unity.onnx_policy import OnnxFolder
 from mappo_unity.play import Pace, open_scene, play, policy_of
+from mappo_unity.runs import folder as runs
 from mappo_unity.scenes.core.shapes import RED, ball
 from mappo_unity.scenes.drawings import drawing_of
 from mappo_unity.window import Window

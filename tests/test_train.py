@@ -12,8 +12,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mappo_unity import checkpoint, series
-from mappo_unity.checkpoint import CheckpointError
+from mappo_unity import series
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import (
     CollectConfig,
@@ -27,6 +26,8 @@ from mappo_unity.config.schema import (
     PPOConfig,
 )
 from mappo_unity.matches import Score
+from mappo_unity.runs import checkpoint
+from mappo_unity.runs.checkpoint import CheckpointError
 from mappo_unity.train import Trainer, train
 
 TIMES = {"wall_s", "steps_per_s", "collect_s", "update_s"}

@@ -33,7 +33,7 @@ from mappo_unity.config.overrides import (
 )
 from mappo_unity.config.presets import conf_dir, group_choices
 from mappo_unity.config.schema import Config, ConfigError
-from mappo_unity.runs import CONFIG, find_run
+from mappo_unity.runs.folder import CONFIG, find_run
 
 _ALWAYS_SAVED = ("env", "output_dir")
 """The first and the last option of a run's config.yaml: a file that lacks one has been cut off."""

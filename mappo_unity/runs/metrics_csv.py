@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from mappo_unity.atomic import write_atomically
+from mappo_unity.runs.atomic import write_atomically
 
 STEP = "agent_steps"
 

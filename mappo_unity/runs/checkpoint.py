@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from mappo_unity.atomic import write_atomically
 from mappo_unity.config.schema import ConfigError
+from mappo_unity.runs.atomic import write_atomically
 
 FORMAT = 2
 FOLDER = "checkpoints"

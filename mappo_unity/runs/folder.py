@@ -20,10 +20,10 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from mappo_unity.atomic import write_atomically
 from mappo_unity.config.overrides import shell_argument
 from mappo_unity.config.schema import Config, ConfigError
-from mappo_unity.run_lock import LOCK
+from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.lock import LOCK
 
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
 RECORD = (CONFIG, OVERRIDES, VERSIONS)
@@ -153,7 +153,7 @@ def read_versions() -> dict[str, Any]:
         from mappo_unity import __version__
 
         versions["mappo-unity"] = __version__
-    return {**versions, **_git_state(Path(__file__).resolve().parents[1])}
+    return {**versions, **_git_state(Path(__file__).resolve().parents[2])}
 
 
 def _claim(wanted: Path, exact: bool) -> Path:

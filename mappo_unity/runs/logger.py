@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from mappo_unity.config.schema import ConfigError, LogBackend, LogConfig
-from mappo_unity.metrics_file import STEP, MetricsFile, keep_until, read_metrics
-from mappo_unity.progress import Progress
+from mappo_unity.runs.metrics_csv import STEP, MetricsFile, keep_until, read_metrics
+from mappo_unity.runs.progress import Progress
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
