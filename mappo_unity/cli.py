@@ -256,7 +256,7 @@ def _eval_command(lines: list[str]) -> int:
         options = vars(compose_plain(lines, EvalConfig))
         run = Path(options.pop("run"))
         check_factory(config_to_play(run, options["env"]))
-        from mappo_unity.evaluate import evaluate
+        from mappo_unity.policies.evaluate import evaluate
 
     result: dict[str, Any] = evaluate(run, **options)
     from mappo_unity import report
@@ -272,7 +272,7 @@ def _play_command(lines: list[str]) -> int:
 
         options = compose_plain(lines, PlayConfig)
         check_factory(config_to_play(Path(options.run or ""), options.env))
-        from mappo_unity.play import play
+        from mappo_unity.policies.film import play
         from mappo_unity.report import play_line
 
     print(play_line(play(options)))
@@ -287,8 +287,8 @@ def _export_command(lines: list[str]) -> int:
     run = Path(options.run)
     find_run(run, "run")
     with interrupts_wait():
-        from mappo_unity.evaluate import choose_checkpoint
-        from mappo_unity.export import export_checkpoint
+        from mappo_unity.policies.evaluate import choose_checkpoint
+        from mappo_unity.policies.export import export_checkpoint
 
     checkpoint = choose_checkpoint(run)
     for file in export_checkpoint(checkpoint, Path(options.out) if options.out else None):

@@ -31,12 +31,12 @@ from mappo_unity.config.per_behavior import options_of
 from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.drops import drop_episodes
 from mappo_unity.envs.transforms import transformed
-from mappo_unity.export import RunExports, sample_inputs
 from mappo_unity.fit import check_fits, describe_models, describe_policies
 from mappo_unity.interrupts import handled
 from mappo_unity.learning.actor_critic import JointPolicy
 from mappo_unity.memory import is_out_of_memory
 from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
+from mappo_unity.policies.export import RunExports, sample_inputs
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.logger import RunLog, check_backends
 from mappo_unity.runs.rng import get_rng_state, set_rng_state

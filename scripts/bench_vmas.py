@@ -145,8 +145,8 @@ class Run:
         import torch
         from vmas_env import make
 
-        from mappo_unity.evaluate import play
-        from mappo_unity.policies import ActorPolicy
+        from mappo_unity.policies.evaluate import play
+        from mappo_unity.policies.policy import ActorPolicy
 
         actors = {name: learner.actor for name, learner in trainer.learners.items()}
         policy = ActorPolicy(trainer._layout(), actors, True, "the policy")

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mappo_unity.evaluate import open_policy
+from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.scenes.dungeon_escape.layout import DRAGON, DRAGON_START_YAW
 from mappo_unity.scenes.dungeon_escape.scene import DungeonEscape
 

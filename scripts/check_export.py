@@ -37,10 +37,10 @@ import torch
 from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.backends import MakeEnv, make_env_function
-from mappo_unity.episodes import play, standard_error
-from mappo_unity.evaluate import choose_checkpoint
-from mappo_unity.export import export_checkpoint
-from mappo_unity.policies import CheckpointPolicy
+from mappo_unity.policies.episodes import play, standard_error
+from mappo_unity.policies.evaluate import choose_checkpoint
+from mappo_unity.policies.export import export_checkpoint
+from mappo_unity.policies.policy import CheckpointPolicy
 
 RUN_POLICY = Path(__file__).resolve().parents[2] / "shared" / "oracle" / "run_policy.py"
 PLAYS = ["sampled", "deterministic"]

@@ -19,10 +19,10 @@ from pathlib import Path
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.envs.backends import make_env_function
-from mappo_unity.evaluate import match_figures
 from mappo_unity.fit import describe_policies
-from mappo_unity.matches import play_matches
-from mappo_unity.policies import ActorPolicy, RandomPolicy
+from mappo_unity.policies.evaluate import match_figures
+from mappo_unity.policies.matches import play_matches
+from mappo_unity.policies.policy import ActorPolicy, RandomPolicy
 from mappo_unity.train import Trainer
 
 QUIET = ["log.progress=false", "log.backends=[]", "export_onnx=false", "checkpoint_interval=1000000000"]

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from mappo_unity.policies import RandomPolicy
-from mappo_unity.render import Renderer
+from mappo_unity.policies.policy import RandomPolicy
+from mappo_unity.policies.render import Renderer
 from mappo_unity.scenes import make_scene, scene_names
 from mappo_unity.scenes.drawings import drawing_of
 

@@ -122,7 +122,7 @@ def player_of(pid: int) -> int | None:
 
 def report(run: Path, code: int, troubles: int) -> int:
     """Print how it ended; return the exit code."""
-    from mappo_unity.evaluate import evaluate
+    from mappo_unity.policies.evaluate import evaluate
 
     with (run / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -13,7 +13,7 @@ from mappo_unity.config.schema import ModelConfig
 from mappo_unity.learning.actor_critic import make_actor
 from mappo_unity.learning.distributions import ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
-from mappo_unity.onnx_graph import build_model
+from mappo_unity.policies.onnx_graph import build_model
 
 
 def make(sensors, continuous=0, branches=(), joint=False, team_size=1, **model):

@@ -426,9 +426,9 @@ def test_evaluation_prints_a_table_and_one_line_of_json(
         calls.append((run, options))
         return {"return_mean": 99.5, "return_stderr": float("nan"), "3DBall": {"length_mean": 1000.0}}
 
-    module = ModuleType("mappo_unity.evaluate")
+    module = ModuleType("mappo_unity.policies.evaluate")
     vars(module)["evaluate"] = evaluate
-    monkeypatch.setitem(sys.modules, "mappo_unity.evaluate", module)
+    monkeypatch.setitem(sys.modules, "mappo_unity.policies.evaluate", module)
     train_main(["hydra.run.dir=mine"])
     capsys.readouterr()
     assert eval_main(["run=mine", "episodes=20", "deterministic=true"]) == 0

@@ -16,8 +16,8 @@ from mappo_unity.collect import make_collector
 from mappo_unity.config.schema import ConfigError, EnvironmentFailure
 from mappo_unity.drops import drop_episodes, episode_rows
 from mappo_unity.envs.unity_env import UnityEnv
-from mappo_unity.episodes import play
-from mappo_unity.policies import RandomPolicy
+from mappo_unity.policies.episodes import play
+from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.scenes import make_scene
 

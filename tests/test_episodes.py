@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mappo_unity.envs.rounds import Episode
-from mappo_unity.episodes import standard_error, summarize
+from mappo_unity.policies.episodes import standard_error, summarize
 
 
 def test_episodes_of_agents_alone_have_the_textbook_s_standard_error():

@@ -11,15 +11,15 @@ import torch
 from onnx_fakes import official_policy, run_policy
 from tensordict import TensorDict
 
-from mappo_unity import export
 from mappo_unity.cli import eval_main, export_main
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import CollectConfig, Config, EnvConfig, LogConfig, ModelConfig, PPOConfig
-from mappo_unity.evaluate import evaluate
-from mappo_unity.export import RunExports, export_checkpoint, sample_inputs
-from mappo_unity.onnx_graph import ExportError
-from mappo_unity.onnx_policy import OnnxPolicy
-from mappo_unity.policies import CheckpointPolicy
+from mappo_unity.policies import export
+from mappo_unity.policies.evaluate import evaluate
+from mappo_unity.policies.export import RunExports, export_checkpoint, sample_inputs
+from mappo_unity.policies.onnx_graph import ExportError
+from mappo_unity.policies.onnx_policy import OnnxPolicy
+from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import write_record
 from mappo_unity.scenes import make_scene

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mappo_unity.config.compose import compose_config
-from mappo_unity.evaluate import evaluate
+from mappo_unity.policies.evaluate import evaluate
 from mappo_unity.runs.folder import write_record
 from mappo_unity.train import train
 

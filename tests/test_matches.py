@@ -7,8 +7,8 @@ from mlagents_envs.base_env import ActionSpec, BaseEnv, DecisionSteps, TerminalS
 
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.rounds import Episode
-from mappo_unity.matches import Score, count, find_sides, play_matches, wilson
-from mappo_unity.policies import RandomPolicy
+from mappo_unity.policies.matches import Score, count, find_sides, play_matches, wilson
+from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.scenes import make_scene
 
 SIDES = ("Duel?team=1", "Duel?team=0")

@@ -9,9 +9,9 @@ import torch
 from onnx_fakes import data_of, inputs, make
 
 from mappo_unity.config.schema import Activation
-from mappo_unity.onnx_check import compare
-from mappo_unity.onnx_graph import ExportError, build_model
-from mappo_unity.onnx_policy import open_session
+from mappo_unity.policies.onnx_check import compare
+from mappo_unity.policies.onnx_graph import ExportError, build_model
+from mappo_unity.policies.onnx_policy import open_session
 
 WALL_JUMP = [3, 3, 3, 2]
 

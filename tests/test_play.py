@@ -21,12 +21,12 @@ from mappo_unity.config.schema import (
     PlayConfig,
     PPOConfig,
 )
-from mappo_unity.onnx_policy import OnnxFolder
-from mappo_unity.play import Pace, open_scene, play, policy_of
+from mappo_unity.policies.film import Pace, open_scene, play, policy_of
+from mappo_unity.policies.onnx_policy import OnnxFolder
+from mappo_unity.policies.window import Window
 from mappo_unity.runs import folder as runs
 from mappo_unity.scenes.core.shapes import RED, ball
 from mappo_unity.scenes.drawings import drawing_of
-from mappo_unity.window import Window
 
 
 def test_films_run_at_the_pace_of_their_scene() -> None:

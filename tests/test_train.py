@@ -25,7 +25,7 @@ from mappo_unity.config.schema import (
     ModelConfig,
     PPOConfig,
 )
-from mappo_unity.matches import Score
+from mappo_unity.policies.matches import Score
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.checkpoint import CheckpointError
 from mappo_unity.train import Trainer, train

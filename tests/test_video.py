@@ -12,9 +12,9 @@ from films import CAMERA, SIZE, frames_of, gif_durations_ms, where
 
 from mappo_unity.cli import play_main
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.render import Renderer
+from mappo_unity.policies.render import Renderer
+from mappo_unity.policies.video import VideoFile, check_video
 from mappo_unity.scenes.core.shapes import BLUE, GREEN, RED, Camera, ball, box, capsule, yaw_rotation
-from mappo_unity.video import VideoFile, check_video
 
 
 def test_pictures_show_right_up_and_ahead_as_unity_does(renderer: Renderer) -> None:

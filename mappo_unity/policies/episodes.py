@@ -12,7 +12,7 @@ import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
 from mappo_unity.envs.rounds import Episode
-from mappo_unity.policies import Policy
+from mappo_unity.policies.policy import Policy
 
 MAX_ENV_STEPS = 5_000_000
 NUM_BATCHES = 40  # of consecutive episodes, at most

@@ -15,7 +15,7 @@ from typing import Any
 import mujoco
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.render import Stage
+from mappo_unity.policies.render import Stage
 from mappo_unity.scenes.core.shapes import Camera, Shape
 
 

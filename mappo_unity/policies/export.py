@@ -18,10 +18,10 @@ import torch
 from tensordict import TensorDictBase
 
 from mappo_unity import keys
-from mappo_unity.onnx_check import compare
-from mappo_unity.onnx_graph import ExportError, build_model
-from mappo_unity.onnx_policy import SUFFIX, file_name
-from mappo_unity.policies import CheckpointPolicy
+from mappo_unity.policies.onnx_check import compare
+from mappo_unity.policies.onnx_graph import ExportError, build_model
+from mappo_unity.policies.onnx_policy import SUFFIX, file_name
+from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.atomic import write_atomically
 

@@ -19,9 +19,9 @@ from mlagents_envs.base_env import BaseEnv
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.backends import MakeEnv
 from mappo_unity.envs.rounds import Episode
-from mappo_unity.episodes import play
 from mappo_unity.keys import team_id
-from mappo_unity.policies import Policy
+from mappo_unity.policies.episodes import play
+from mappo_unity.policies.policy import Policy
 
 Z95 = 1.959964  # two-sided 95 % quantile of the standard normal distribution
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.render import Renderer
+from mappo_unity.policies.render import Renderer
 from mappo_unity.scenes.core.shapes import Camera, Shape
 
 SUFFIXES = (".mp4", ".gif")

@@ -13,10 +13,10 @@ import torch
 from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.backends import make_env_function
-from mappo_unity.episodes import play, summarize
-from mappo_unity.matches import Score, play_matches
-from mappo_unity.onnx_policy import SUFFIX, OnnxFolder, OnnxPolicy
-from mappo_unity.policies import CheckpointPolicy, Policy, RandomPolicy
+from mappo_unity.policies.episodes import play, summarize
+from mappo_unity.policies.matches import Score, play_matches
+from mappo_unity.policies.onnx_policy import SUFFIX, OnnxFolder, OnnxPolicy
+from mappo_unity.policies.policy import CheckpointPolicy, Policy, RandomPolicy
 from mappo_unity.runs import checkpoint
 
 
