@@ -196,7 +196,7 @@ def _train_locked(config: Config, folder: Path, source: Path, lines: list[str]) 
     for warning in warnings:
         print(f"mappo-train: {warning}", file=sys.stderr)
     with interrupts_wait():
-        from mappo_unity.train import why_over
+        from mappo_unity.training.trainer import why_over
 
         reason = why_over(config, checkpoint)
     if reason is not None:
@@ -213,7 +213,7 @@ def _train_locked(config: Config, folder: Path, source: Path, lines: list[str]) 
 
 def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
     with interrupts_wait():
-        from mappo_unity.train import train
+        from mappo_unity.training.trainer import train
 
     print(f"continuing from {checkpoint}" if checkpoint else f"run folder: {folder}", flush=True)
     outcome = train(config, folder, checkpoint)
@@ -234,7 +234,7 @@ def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
 
 def _sweep(lines: list[str]) -> int:
     from mappo_unity import report
-    from mappo_unity.sweep import run_sweep
+    from mappo_unity.training.sweep import run_sweep
 
     result = run_sweep(lines)
     report.write_csv(result)

@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 from mappo_unity.config.overrides import shell_argument, shell_word
-from mappo_unity.sweep import JobResult, SweepResult, job_options, varied_options
+from mappo_unity.training.sweep import JobResult, SweepResult, job_options, varied_options
 
 if TYPE_CHECKING:
-    from mappo_unity.train import Outcome
+    from mappo_unity.training.trainer import Outcome
 
 RESULTS = "results.csv"
 _PIPE_WIDTH = 160  # columns of a table that nobody's terminal limits

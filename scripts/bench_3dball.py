@@ -21,12 +21,12 @@ import torch
 from mlagents_envs.base_env import ActionTuple
 from torch import nn
 
-from mappo_unity.build import batch_rounds
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
 from mappo_unity.learning.mlp import make_mlp
 from mappo_unity.scenes import make_scene
-from mappo_unity.train import Trainer
+from mappo_unity.training.build import batch_rounds
+from mappo_unity.training.trainer import Trainer
 
 
 def main() -> None:

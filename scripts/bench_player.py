@@ -26,11 +26,11 @@ import torch
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.envs.backends import make_env_function
-from mappo_unity.metrics import count_decisions
 from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.serve import Player, env_function
 from mappo_unity.protocol.serve import main as player_main
-from mappo_unity.train import Trainer
+from mappo_unity.training.episode_stats import count_decisions
+from mappo_unity.training.trainer import Trainer
 
 from mlagents_envs.base_env import BaseEnv  # isort: skip  # mappo_unity lets it import
 

@@ -122,7 +122,7 @@ class Run:
 
     def train(self) -> None:
         """Train to the end, evaluating about twenty times on the way."""
-        from mappo_unity.train import Trainer
+        from mappo_unity.training.trainer import Trainer
 
         with tempfile.TemporaryDirectory() as folder:
             trainer = Trainer(self.cfg, Path(folder))

@@ -19,11 +19,11 @@ from pathlib import Path
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.envs.backends import make_env_function
-from mappo_unity.fit import describe_policies
 from mappo_unity.policies.evaluate import match_figures
 from mappo_unity.policies.matches import play_matches
 from mappo_unity.policies.policy import ActorPolicy, RandomPolicy
-from mappo_unity.train import Trainer
+from mappo_unity.training.resume_check import describe_policies
+from mappo_unity.training.trainer import Trainer
 
 QUIET = ["log.progress=false", "log.backends=[]", "export_onnx=false", "checkpoint_interval=1000000000"]
 

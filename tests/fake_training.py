@@ -1,4 +1,4 @@
-"""A training that is over at once, in the place of mappo_unity.train: its return says its options.
+"""A training that is over at once, in the place of mappo_unity.training.trainer: its return says its options.
 
 Seed 13 fails, seed 15 is ended by SIGTERM; those above 90 wait for a signal, then a second for a checkpoint.
 """

@@ -20,7 +20,7 @@ from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.scenes import make_scene, scene_names
 from mappo_unity.scenes.core.contract import check_env
-from mappo_unity.train import Outcome, Trainer
+from mappo_unity.training.trainer import Outcome, Trainer
 
 ROOT = Path(__file__).resolve().parents[1]
 AREAS = 2

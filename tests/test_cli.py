@@ -30,7 +30,7 @@ from mappo_unity.runs.lock import locked
 
 
 class FakeTraining:
-    """Stand in for mappo_unity.train and mappo_unity.runs.checkpoint; keep the calls."""
+    """Stand in for mappo_unity.training.trainer and mappo_unity.runs.checkpoint; keep the calls."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[Config, Path, Path | None]] = []
@@ -214,7 +214,7 @@ def test_players_that_came_up_in_vain_leave_nothing(training: FakeTraining, name
         log.write_text("a player's words")
         raise ConfigError(f"its log: {log}" if named else "matches need two sides")
 
-    sys.modules["mappo_unity.train"].train = train  # type: ignore[attr-defined]
+    sys.modules["mappo_unity.training.trainer"].train = train  # type: ignore[attr-defined]
     assert train_main(["hydra.run.dir=mine"]) == 2
     assert Path("mine").exists() == named
 
@@ -228,7 +228,7 @@ def test_a_refused_continuation_with_players_keeps_its_options(training: FakeTra
         (folder / "players" / "Player-0.log").write_text("a player's words")
         raise ConfigError("another network")
 
-    sys.modules["mappo_unity.train"].train = train  # type: ignore[attr-defined]
+    sys.modules["mappo_unity.training.trainer"].train = train  # type: ignore[attr-defined]
     assert train_main(["resume=mine", "model.hidden=[3]"]) == 2
     assert Path("mine/config.yaml").read_text() == before
 
@@ -246,7 +246,7 @@ def test_a_run_folder_that_is_removed_meanwhile(
         shutil.rmtree(folder)
         raise ConfigError("the run folder was removed")
 
-    monkeypatch.setattr(sys.modules["mappo_unity.train"], "train", train)
+    monkeypatch.setattr(sys.modules["mappo_unity.training.trainer"], "train", train)
     assert train_main([]) == 2
     assert capsys.readouterr().err == "mappo-train: the run folder was removed\n"
     assert train_main(["-m", "seed=1,2"]) == 1  # the jobs fail, and the table says so
@@ -354,7 +354,7 @@ def test_a_run_holds_its_lock_while_it_trains(training: FakeTraining) -> None:
         seen.append(folder.name)
         return Outcome()
 
-    sys.modules["mappo_unity.train"].train = train  # type: ignore[attr-defined]
+    sys.modules["mappo_unity.training.trainer"].train = train  # type: ignore[attr-defined]
     assert train_main(["hydra.run.dir=mine"]) == train_main(["resume=mine"]) == 0
     assert train_main(["-m", "seed=0,1"]) == 0
     assert seen == ["mine", "mine", "0", "1"]

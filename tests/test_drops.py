@@ -12,14 +12,14 @@ import torch
 from fakes import Record, ScriptedEnv, behavior_spec
 
 from mappo_unity.cli import train_main
-from mappo_unity.collect import make_collector
 from mappo_unity.config.schema import ConfigError, EnvironmentFailure
-from mappo_unity.drops import drop_episodes, episode_rows
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.policies.episodes import play
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.scenes import make_scene
+from mappo_unity.training.collect import make_collector
+from mappo_unity.training.crashed_episodes import drop_episodes, episode_rows
 
 FAKE = "Fake?team=0"
 
@@ -178,7 +178,7 @@ def test_past_the_limit_there_is_a_checkpoint_and_exit_code_3(tmp_path: Path, ca
 def test_runs_without_players_have_no_such_columns(tmp_path: Path) -> None:
     from test_train import options
 
-    from mappo_unity.train import Trainer
+    from mappo_unity.training.trainer import Trainer
 
     trainer = Trainer(options(1), tmp_path)
     assert trainer._drop_cut_off(next(iter(trainer.make_collector()))) == {}

@@ -23,7 +23,7 @@ from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import write_record
 from mappo_unity.scenes import make_scene
-from mappo_unity.train import Trainer, train
+from mappo_unity.training.trainer import Trainer, train
 
 AREAS, ROUNDS = 4, 16
 

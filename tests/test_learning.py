@@ -7,7 +7,7 @@ import pytest
 from mappo_unity.config.compose import compose_config
 from mappo_unity.policies.evaluate import evaluate
 from mappo_unity.runs.folder import write_record
-from mappo_unity.train import train
+from mappo_unity.training.trainer import train
 
 
 @pytest.mark.slow

@@ -58,7 +58,7 @@ def test_a_run_is_filmed_from_the_command_line(
     run = tmp_path / "run"
     run.mkdir()
     runs.write_record(run, cfg, [])
-    train = importlib.import_module("mappo_unity.train").train
+    train = importlib.import_module("mappo_unity.training.trainer").train
     train(cfg, run, None)
     video = tmp_path / "film.mp4"
     lines = [f"run={run}", f"video={video}", "seconds=0.4", "width=96", "height=64", "deterministic=true"]

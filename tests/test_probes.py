@@ -16,7 +16,7 @@ from mappo_unity.config.schema import (
     PPOConfig,
     Schedule,
 )
-from mappo_unity.train import Trainer
+from mappo_unity.training.trainer import Trainer
 
 GAMMA = 0.9
 

@@ -5,14 +5,14 @@ import os
 import pytest
 import torch
 
-from mappo_unity import memory
-from mappo_unity import train as training
 from mappo_unity.cli import train_main
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.memory import check_free, is_out_of_memory, show_size
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import CONFIG
 from mappo_unity.runs.logger import RunLog
+from mappo_unity.training import memory
+from mappo_unity.training import trainer as training
+from mappo_unity.training.memory import check_free, is_out_of_memory, show_size
 
 ITERATION = 16 * 16  # decisions: 16 rounds of 16 agents
 FAILING = [

@@ -19,12 +19,12 @@ from mappo_unity import stopping
 from mappo_unity.cli import train_main
 from mappo_unity.config.compose import load_config
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.sweep import plan_jobs, run_sweep
+from mappo_unity.training.sweep import plan_jobs, run_sweep
 
 
 @pytest.fixture(autouse=True)
 def _training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "mappo_unity.train", fake_training)
+    monkeypatch.setitem(sys.modules, "mappo_unity.training.trainer", fake_training)
     monkeypatch.chdir(tmp_path)
 
 
@@ -177,7 +177,7 @@ def test_a_failed_trial_ends_no_search() -> None:
 
 def start_with_fake_training(tmp_path: Path, *lines: str) -> subprocess.Popen[str]:
     """Start a sweep; every process of its interpreter has the fake training in the place of the real one."""
-    starter = "import sys, fake_training\nsys.modules['mappo_unity.train'] = fake_training\n"
+    starter = "import sys, fake_training\nsys.modules['mappo_unity.training.trainer'] = fake_training\n"
     (tmp_path / "start").mkdir()
     (tmp_path / "start" / "sitecustomize.py").write_text(starter)
     tests = Path(__file__).resolve().parent

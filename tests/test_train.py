@@ -12,7 +12,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mappo_unity import series
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import (
     CollectConfig,
@@ -28,7 +27,8 @@ from mappo_unity.config.schema import (
 from mappo_unity.policies.matches import Score
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.checkpoint import CheckpointError
-from mappo_unity.train import Trainer, train
+from mappo_unity.training import match_series as series
+from mappo_unity.training.trainer import Trainer, train
 
 TIMES = {"wall_s", "steps_per_s", "collect_s", "update_s"}
 AREAS, ROUNDS = 6, 20
@@ -224,7 +224,7 @@ def test_a_signal_to_the_process_and_to_its_group_is_one(tmp_path, monkeypatch):
     outcome = train(options(4), tmp_path)
     assert (outcome.status, outcome.signal) == ("interrupted", signal.SIGINT)
     assert outcome.last_checkpoint.is_file()
-    monkeypatch.setattr("mappo_unity.train.ECHO_S", -1.0)
+    monkeypatch.setattr("mappo_unity.training.trainer.ECHO_S", -1.0)
     with pytest.raises(KeyboardInterrupt):
         train(options(4), tmp_path / "other")
 

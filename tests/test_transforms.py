@@ -8,7 +8,6 @@ from mlagents_envs.base_env import ActionSpec
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.modules import ProbabilisticActor
 
-from mappo_unity.collect import make_collector
 from mappo_unity.config.schema import ModelConfig
 from mappo_unity.envs.transforms import make_transforms, transformed
 from mappo_unity.envs.unity_env import UnityEnv
@@ -16,6 +15,7 @@ from mappo_unity.learning.actor_critic import JointPolicy, make_actor
 from mappo_unity.learning.distributions import ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
 from mappo_unity.scenes import make_scene
+from mappo_unity.training.collect import make_collector
 
 END, CUT = "terminated", "interrupted"
 

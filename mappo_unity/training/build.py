@@ -11,7 +11,6 @@ from pathlib import Path
 
 import torch
 
-from mappo_unity.collect import num_rounds
 from mappo_unity.config.per_behavior import check_behaviors, options_of
 from mappo_unity.config.schema import Config, ConfigError, ModelConfig
 from mappo_unity.envs.backends import make_env_function
@@ -20,9 +19,10 @@ from mappo_unity.learning.actor_critic import make_actor, make_critic
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
 from mappo_unity.learning.ppo import PolicyLearner
-from mappo_unity.memory import check_free, show_size
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.rng import seed_everything
+from mappo_unity.training.collect import num_rounds
+from mappo_unity.training.memory import check_free, show_size
 
 BATCH_COPIES = 6
 """Memory of a batch in units of its observations: as they were and as next ones, as rounds and as a stack of

@@ -24,25 +24,25 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
-from mappo_unity.build import batch_rounds, make_learners, make_unity_env, prepare_torch
-from mappo_unity.collect import make_collector
 from mappo_unity.config.overrides import shell_argument
 from mappo_unity.config.per_behavior import options_of
 from mappo_unity.config.schema import Config, ConfigError
-from mappo_unity.drops import drop_episodes
 from mappo_unity.envs.transforms import transformed
-from mappo_unity.fit import check_fits, describe_models, describe_policies
 from mappo_unity.interrupts import handled
 from mappo_unity.learning.actor_critic import JointPolicy
-from mappo_unity.memory import is_out_of_memory
-from mappo_unity.metrics import EpisodeWindow, by_policy, count_decisions
 from mappo_unity.policies.export import RunExports, sample_inputs
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.logger import RunLog, check_backends
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
-from mappo_unity.series import MatchSeries
 from mappo_unity.stopping import ECHO_S
 from mappo_unity.termination import Interrupted
+from mappo_unity.training.build import batch_rounds, make_learners, make_unity_env, prepare_torch
+from mappo_unity.training.collect import make_collector
+from mappo_unity.training.crashed_episodes import drop_episodes
+from mappo_unity.training.episode_stats import EpisodeWindow, by_policy, count_decisions
+from mappo_unity.training.match_series import MatchSeries
+from mappo_unity.training.memory import is_out_of_memory
+from mappo_unity.training.resume_check import check_fits, describe_models, describe_policies
 
 PATIENCE_S = 5.0  # after a signal, before the iteration is given up
 DIVERGED = "diverged"  # status of a run most of whose updates were rolled back

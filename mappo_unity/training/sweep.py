@@ -179,7 +179,7 @@ def _train(config: Config, folder: Path, result: JobResult) -> int | None:
     write_record(folder, config, result.overrides)
     check_factory(config)
     with interrupts_wait():
-        from mappo_unity.train import train
+        from mappo_unity.training.trainer import train
 
     outcome = train(config, folder)
     result.status = outcome.status

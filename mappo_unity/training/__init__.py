@@ -1,0 +1,4 @@
+"""The training loop and what surrounds it.
+
+In: a checked `Config`, a run folder. Out: checkpoints, metrics, an `Outcome`.
+"""
