@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from mappo_unity.cli import doctor_main
+from mappo_unity.cli.doctor import CURES, diagnose, port_state
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.doctor import CURES, diagnose, port_state
 from mappo_unity.protocol.serve import main as player_main
 
 BAD_PLAYER = Path(__file__).with_name("bad_player.py")

@@ -44,7 +44,7 @@ def test_modules_import_only_upward():
 
 
 def test_options_and_help_need_no_torch():
-    light = "mappo_unity.config.compose, mappo_unity.cli, mappo_unity.help"
+    light = "mappo_unity.config.compose, mappo_unity.cli, mappo_unity.cli.help"
     code = f"import sys, {light}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TextIO
 
-from mappo_unity.arguments import check_range
+from mappo_unity.cli.arguments import check_range
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.protocol.protobuf import install
 

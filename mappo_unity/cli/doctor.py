@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.arguments import check_duration, check_range
+from mappo_unity.cli.arguments import check_duration, check_range
 from mappo_unity.config.schema import ConfigError, EnvironmentFailure
 
 PACKAGES = ("torch", "torchrl", "tensordict", "mlagents-envs", "protobuf", "grpcio", "numpy", "mujoco")

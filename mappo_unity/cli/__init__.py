@@ -87,25 +87,25 @@ def _run_command(
 
 
 def _train_help() -> str:
-    from mappo_unity.help import train_help
+    from mappo_unity.cli.help import train_help
 
     return train_help(Config)
 
 
 def _eval_help() -> str:
-    from mappo_unity.help import eval_help
+    from mappo_unity.cli.help import eval_help
 
     return eval_help(EvalConfig)
 
 
 def _play_help() -> str:
-    from mappo_unity.help import play_help
+    from mappo_unity.cli.help import play_help
 
     return play_help(PlayConfig)
 
 
 def _export_help() -> str:
-    from mappo_unity.help import export_help
+    from mappo_unity.cli.help import export_help
 
     return export_help(ExportConfig)
 
@@ -124,14 +124,14 @@ def _player_command(lines: list[str]) -> int:
 
 
 def _doctor_help() -> str:
-    from mappo_unity.doctor import help_text
+    from mappo_unity.cli.doctor import help_text
 
     return help_text()
 
 
 def _doctor_command(lines: list[str]) -> int:
     with interrupts_wait():
-        from mappo_unity.doctor import diagnose
+        from mappo_unity.cli.doctor import diagnose
 
     return diagnose(lines, print)
 
@@ -217,8 +217,8 @@ def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
 
     print(f"continuing from {checkpoint}" if checkpoint else f"run folder: {folder}", flush=True)
     outcome = train(config, folder, checkpoint)
+    from mappo_unity.cli.report import run_summary
     from mappo_unity.config.overrides import shell_argument
-    from mappo_unity.report import run_summary
 
     print("\n".join(run_summary(outcome, folder)), flush=True)
     if outcome.signal is None:
@@ -233,7 +233,7 @@ def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
 
 
 def _sweep(lines: list[str]) -> int:
-    from mappo_unity import report
+    from mappo_unity.cli import report
     from mappo_unity.training.sweep import run_sweep
 
     result = run_sweep(lines)
@@ -259,7 +259,7 @@ def _eval_command(lines: list[str]) -> int:
         from mappo_unity.policies.evaluate import evaluate
 
     result: dict[str, Any] = evaluate(run, **options)
-    from mappo_unity import report
+    from mappo_unity.cli import report
 
     report.console().print(report.eval_table(result))
     print(report.json_line(result))
@@ -272,8 +272,8 @@ def _play_command(lines: list[str]) -> int:
 
         options = compose_plain(lines, PlayConfig)
         check_factory(config_to_play(Path(options.run or ""), options.env))
+        from mappo_unity.cli.report import play_line
         from mappo_unity.policies.film import play
-        from mappo_unity.report import play_line
 
     print(play_line(play(options)))
     return 0
