@@ -55,7 +55,7 @@ class FakeTraining:
 @pytest.fixture
 def training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeTraining:
     fake = FakeTraining()
-    fakes = {"train": [fake.train, fake_training.why_over], "checkpoint": [fake.newest_good]}
+    fakes = {"training.trainer": [fake.train, fake_training.why_over], "runs.checkpoint": [fake.newest_good]}
     for name, functions in fakes.items():
         module = ModuleType(f"mappo_unity.{name}")
         for function in functions:

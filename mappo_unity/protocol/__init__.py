@@ -1,8 +1,8 @@
 """The ML-Agents protocol (API 1.5.0) between a trainer and Unity players, from both ends.
 
-`messages` and `batch_encoding`: bytes on the wire. `server`, `process`, `client`: a trainer's side, one running
-player as a BaseEnv. `restarting_player`, `parallel_players`: players that fail, and many of them. `serve`: a
-scene as a player. Knows nothing of learning.
+`messages` and `batch_encoding`: bytes on the wire. `server`, `process`, `client`: a trainer's side, one
+running player as a BaseEnv. `restarting_player`, `parallel_players`: players that fail, and many of them.
+`serve`: a scene as a player. Knows nothing of learning.
 """
 
 import os

@@ -26,11 +26,7 @@ import numpy as np  # noqa: E402
 from mlagents_envs.base_env import BaseEnv  # noqa: E402
 
 from mappo_unity import __version__  # noqa: E402
-from mappo_unity.protocol import (
-    encode,
-    messages,
-    side_channels,
-)
+from mappo_unity.protocol import encode, messages, side_channels  # noqa: E402
 from mappo_unity.protocol.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
 from mappo_unity.protocol.player_build import build  # noqa: E402
 

@@ -3,7 +3,7 @@
 In: an environment, or a scene's name on the command line. Out: a summary, or `ContractError` that names
 the behavior, the agent and what is wrong. Knows nothing of any scene.
 
-    python -m mappo_unity.scenes.core.contract 3DBall [--steps 500] [--num-areas 4]
+    python -m mappo_unity.scenes.check 3DBall [--steps 500] [--num-areas 4]
 """
 
 from __future__ import annotations
@@ -298,7 +298,7 @@ def _require(holds: bool, message: str) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Check an embedded scene from the command line; return 0 if it keeps the contract."""
-    parser = argparse.ArgumentParser(prog="python -m mappo_unity.scenes.core.contract", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m mappo_unity.scenes.check", description=__doc__)
     parser.add_argument("scene", help=f"one of: {', '.join(scene_names())}")
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--num-areas", type=int, default=None)
