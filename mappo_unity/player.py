@@ -1,4 +1,4 @@
-"""The old place of mappo-player: player folders built before the rooms start it as ``-m mappo_unity.player``."""
+"""The old place of mappo-player, which older player folders start as ``-m mappo_unity.player``."""
 
 from mappo_unity.cli import player_main
 

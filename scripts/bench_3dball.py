@@ -25,8 +25,8 @@ from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
 from mappo_unity.learning.mlp import make_mlp
 from mappo_unity.scenes import make_scene
-from mappo_unity.training.build import batch_rounds
-from mappo_unity.training.trainer import Trainer
+from mappo_unity.training.setup import entries_of, set_up
+from mappo_unity.training.trainer import train
 
 
 def main() -> None:
@@ -61,11 +61,8 @@ def time_to_95(cfg: Config) -> None:
     """Train until the mean return over a full window of finished episodes is 95."""
     cfg = compose_config([f"seed={cfg.seed}", "log.progress=false", "stop_at_return=95"]).config
     with tempfile.TemporaryDirectory() as folder:
-        trainer = Trainer(cfg, Path(folder))
-        start = time.perf_counter()
-        outcome = trainer.run()
-        seconds = time.perf_counter() - start
-        trainer.close()
+        outcome = train(cfg, Path(folder))
+    seconds = outcome.wall_s
     print(
         f"mean return {outcome.return_mean:.1f} ({outcome.status}) after {seconds:.1f} s from the first "
         f"environment step, {outcome.agent_steps:,} agent steps, {outcome.agent_steps / seconds:,.0f}/s"
@@ -76,9 +73,7 @@ def whole_run(seed: int) -> None:
     """Train with the default options to the end."""
     cfg = compose_config([f"seed={seed}", "log.progress=false"]).config
     with tempfile.TemporaryDirectory() as folder:
-        trainer = Trainer(cfg, Path(folder))
-        outcome = trainer.run()
-        trainer.close()
+        outcome = train(cfg, Path(folder))
     print(
         f"seed {seed}: mean return {outcome.return_mean:.2f} over the last {cfg.log.return_window} episodes, "
         f"{outcome.agent_steps:,} agent steps, {outcome.wall_s:.1f} s"
@@ -87,10 +82,12 @@ def whole_run(seed: int) -> None:
 
 def collection(cfg: Config, repeats: int) -> None:
     """Compare the collector with a bare loop: scene step and forward pass of the same network."""
-    with tempfile.TemporaryDirectory() as folder:
-        trainer = Trainer(cfg, Path(folder))
-        rounds = batch_rounds(cfg, trainer.env)
-        batches = iter(trainer.make_collector())
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        set_up(cfg, Path(folder)) as setup,
+        setup.collecting() as batches,
+    ):
+        rounds = setup.rounds
         bare = BareLoop(cfg)
         next(batches), bare.collect(rounds)
         ours, theirs, ratios = [], [], []
@@ -104,7 +101,6 @@ def collection(cfg: Config, repeats: int) -> None:
             f"{steps / statistics.median(theirs):,.0f}/s; ratio {statistics.median(ratios):.2f} "
             f"({min(ratios):.2f} to {max(ratios):.2f})"
         )
-        trainer.close()
 
 
 class BareLoop:
@@ -131,11 +127,13 @@ class BareLoop:
 
 def updates(cfg: Config, repeats: int) -> None:
     """Compare the learner's epochs with a hand-written PPO update on the same rows."""
-    with tempfile.TemporaryDirectory() as folder:
-        trainer = Trainer(cfg, Path(folder))
-        learner = next(iter(trainer.learners.values()))
-        batch = next(iter(trainer.make_collector()))
-        entries = trainer.entries(batch, next(iter(trainer.learners)))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        set_up(cfg, Path(folder)) as setup,
+        setup.collecting() as batches,
+    ):
+        name, learner = next(iter(setup.learners.items()))
+        entries = entries_of(next(batches), name)
         rows, _ = learner._prepare(entries)
         hand = HandWritten(cfg)
         data = [
@@ -153,7 +151,6 @@ def updates(cfg: Config, repeats: int) -> None:
             f"hand-written {statistics.median(theirs) * 1e3:.0f} ms; speed ratio "
             f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
         )
-        trainer.close()
 
 
 class HandWritten:

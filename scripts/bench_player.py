@@ -17,6 +17,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,8 @@ from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.serve import Player, env_function
 from mappo_unity.protocol.serve import main as player_main
 from mappo_unity.training.episode_stats import count_decisions
-from mappo_unity.training.trainer import Trainer
+from mappo_unity.training.run_state import RunState
+from mappo_unity.training.setup import TrainingSetup, set_up
 
 from mlagents_envs.base_env import BaseEnv  # isort: skip  # mappo_unity lets it import
 
@@ -171,11 +173,12 @@ class Stepping:
 
 def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
     """Print what a round costs in player, transport, decoding, adapter and policy, CPU microseconds."""
-    trainer = Trainer(cfg, folder / "parts")
-    base_env: Any = trainer.env.base_env
+    stack = ExitStack()
+    setup = stack.enter_context(set_up(cfg, folder / "parts"))
+    base_env: Any = setup.env.base_env
     pid = base_env.player.process.pid
     bare = mlagents_client(cfg)
-    batches = iter(trainer.make_collector())
+    batches = stack.enter_context(setup.collecting())
     next(batches)
     whole: list[tuple[float, float, float, float]] = []
     for _ in range(arguments.repeats):
@@ -188,7 +191,7 @@ def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
                 (time.perf_counter() - wall) / rounds * 1e6,
                 (time.process_time() - cpu) / rounds * 1e6,
                 (cpu_s(pid) - player) / rounds * 1e6,
-                count_decisions(batch, list(trainer.learners)) / rounds,
+                count_decisions(batch, list(setup.learners)) / rounds,
             )
         )
     bare_rates = [a / w for a, w in zip(bare.agents_per_step, bare.wall_us)]
@@ -196,7 +199,7 @@ def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
     wall_us, cpu_us, player_us, agents = (statistics.median(column) for column in zip(*whole))
     data, output_us = player_message(arguments.scene, cfg, arguments.rounds)
     decode_us = decoding(data, arguments.rounds)
-    policy_us = policy(trainer, arguments.rounds)
+    policy_us = policy(setup, arguments.rounds)
     adapter_us = adapter(cfg, arguments)
     print(f"\na round of collecting {arguments.scene}: {agents:.1f} agents act, {wall_us:.0f} us")
     print(f"  end to end                {agents / wall_us * 1e6:10,.0f} agent steps/s")
@@ -213,7 +216,7 @@ def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
     rest = cpu_us - decode_us - adapter_us - policy_us
     print(f"  transport and collector   {rest:10.0f} us CPU (what remains of the trainer's {cpu_us:.0f})")
     bare.env.close()
-    trainer.close()
+    stack.close()
 
 
 def player_message(scene: str, cfg: Config, steps: int) -> tuple[bytes, float]:
@@ -249,13 +252,13 @@ def decoding(data: bytes, steps: int) -> float:
     return cpu_of(once, steps)
 
 
-def policy(trainer: Trainer, steps: int) -> float:
+def policy(setup: TrainingSetup, steps: int) -> float:
     """Return what the policy costs a round, CPU us."""
     from mappo_unity.envs.transforms import transformed
 
-    observations = transformed(trainer.env).reset()
+    observations = transformed(setup.env).reset()
     with torch.no_grad():
-        return cpu_of(lambda: trainer.policy(observations.clone(recurse=False)), steps)
+        return cpu_of(lambda: setup.policy(observations.clone(recurse=False)), steps)
 
 
 def adapter(cfg: Config, arguments: argparse.Namespace) -> float:
@@ -314,26 +317,27 @@ def several(cfg: Config, arguments: argparse.Namespace) -> None:
 
 def train(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
     """Train until the mean return over a full window reaches the goal."""
-    trainer = Trainer(cfg, folder / "train")
-    pid = trainer.env.base_env.player.process.pid
-    batches = iter(trainer.make_collector())
-    wall, cpu, player = time.perf_counter(), time.process_time(), cpu_s(pid)
-    while trainer.agent_steps < cfg.max_steps:
-        trainer.iterate(batches)
-        if trainer.window.full and trainer.window.summary()["return_mean"] >= arguments.goal:
-            break
-    wall_s, cpu_used = time.perf_counter() - wall, time.process_time() - cpu
-    player_used = cpu_s(pid) - player
+    with set_up(cfg, folder / "train") as setup, setup.collecting() as batches:
+        state = RunState(cfg, folder / "train", setup)
+        pid = setup.env.base_env.player.process.pid
+        wall, cpu, player = time.perf_counter(), time.process_time(), cpu_s(pid)
+        while state.agent_steps < cfg.max_steps and not state.recent_episodes.reached(arguments.goal):
+            started = time.perf_counter()
+            batch = next(batches)
+            collected = time.perf_counter()
+            setup.learn(batch, state.agent_steps / cfg.max_steps)
+            state.count(batch, collected - started, time.perf_counter() - collected)
+        wall_s, cpu_used = time.perf_counter() - wall, time.process_time() - cpu
+        player_used = cpu_s(pid) - player
     print(
         "\ntraining with the preset's options to a mean return of "
-        f"{trainer.window.summary()['return_mean']:.1f}: {trainer.agent_steps:,} agent steps, "
-        f"{wall_s:.1f} s, {trainer.agent_steps / wall_s:,.0f} agent steps/s"
+        f"{state.recent_episodes.summary()['return_mean']:.1f}: {state.agent_steps:,} agent steps, "
+        f"{wall_s:.1f} s, {state.agent_steps / wall_s:,.0f} agent steps/s"
     )
     print(
         f"  CPU: trainer {cpu_used:.1f} s, player {player_used:.1f} s: "
-        f"{trainer.agent_steps / (cpu_used + player_used):,.0f} agent steps/s with a core for each"
+        f"{state.agent_steps / (cpu_used + player_used):,.0f} agent steps/s with a core for each"
     )
-    trainer.close()
 
 
 def cpu_of(call: Callable[[], Any], times: int) -> float:

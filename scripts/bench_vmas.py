@@ -119,37 +119,42 @@ class Run:
         self.curve: list[tuple[int, float]] = []  # frames, mean return
         self.seconds = self.cpu_seconds = 0.0
         self.frames = self.rollbacks = 0
+        self.since: float | None = None  # processor time at the end of the last iteration
 
     def train(self) -> None:
         """Train to the end, evaluating about twenty times on the way."""
-        from mappo_unity.training.trainer import Trainer
+        from mappo_unity.training.setup import set_up
+        from mappo_unity.training.trainer import train
 
         with tempfile.TemporaryDirectory() as folder:
-            trainer = Trainer(self.cfg, Path(folder))
-            batches = iter(trainer.make_collector())
-            self.evaluate(trainer)
-            while trainer.agent_steps < self.cfg.max_steps:
-                wall, cpu = time.perf_counter(), time.process_time()
-                trainer.iterate(batches)
-                self.seconds += time.perf_counter() - wall
-                self.cpu_seconds += time.process_time() - cpu
-                self.frames = trainer.agent_steps // self.task.agents
-                done = trainer.agent_steps >= self.cfg.max_steps
-                if done or self.frames - self.curve[-1][0] >= self.cfg.max_steps / self.task.agents / 20:
-                    self.evaluate(trainer)
-            self.rollbacks = sum(learner.rollbacks for learner in trainer.learners.values())
-            trainer.close()
+            with set_up(self.cfg, Path(folder)) as setup:
+                self.evaluate(setup)
+            outcome = train(self.cfg, Path(folder), after_iteration=self.watch)
+        self.seconds = outcome.wall_s
+        self.rollbacks = sum(rolled_back for rolled_back, _ in outcome.updates.values())
 
-    def evaluate(self, trainer: Any) -> None:
+    def watch(self, state: Any) -> None:
+        """Count an iteration's frames and processor time; evaluate now and then."""
+        now = time.process_time()
+        if self.since is not None:
+            self.cpu_seconds += now - self.since
+        self.frames = state.agent_steps // self.task.agents
+        done = state.agent_steps >= self.cfg.max_steps
+        if done or self.frames - self.curve[-1][0] >= self.cfg.max_steps / self.task.agents / 20:
+            self.evaluate(state.setup)
+        self.since = time.process_time()
+
+    def evaluate(self, setup: Any) -> None:
         """Play the deterministic policy on the same episodes as ever; note the mean return."""
         import torch
         from vmas_env import make
 
         from mappo_unity.policies.evaluate import play
         from mappo_unity.policies.policy import ActorPolicy
+        from mappo_unity.training.resume_check import describe_policies
 
-        actors = {name: learner.actor for name, learner in trainer.learners.items()}
-        policy = ActorPolicy(trainer._layout(), actors, True, "the policy")
+        actors = {name: learner.actor for name, learner in setup.learners.items()}
+        policy = ActorPolicy(describe_policies(setup.env), actors, True, "the policy")
         with torch.random.fork_rng(devices=[]):
             env = make(EVAL_SEED, **{**self.cfg.env.params, "num_envs": EVAL_ENVS})
             episodes = next(iter(play(env, policy, EVAL_ENVS * self.task.agents).values()))

@@ -18,12 +18,15 @@ import tempfile
 from pathlib import Path
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.config.schema import Config
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.evaluate import match_figures
 from mappo_unity.policies.matches import play_matches
 from mappo_unity.policies.policy import ActorPolicy, RandomPolicy
 from mappo_unity.training.resume_check import describe_policies
-from mappo_unity.training.trainer import Trainer
+from mappo_unity.training.run_state import RunState
+from mappo_unity.training.setup import TrainingSetup, set_up
+from mappo_unity.training.trainer import train
 
 QUIET = ["log.progress=false", "log.backends=[]", "export_onnx=false", "checkpoint_interval=1000000000"]
 
@@ -57,12 +60,20 @@ def run(arguments: argparse.Namespace, variant: str, seed: int) -> str:
     lines += [f"seed={seed}", *QUIET] + ([f"max_steps={arguments.steps}"] if arguments.steps else [])
     cfg = compose_config(lines).config
     with tempfile.TemporaryDirectory() as folder:
-        trainer = BudgetTrainer(cfg, Path(folder))
-        trainer.seconds = arguments.seconds
-        before = play(trainer, arguments.matches) if arguments.matches else "-"
-        outcome = trainer.run()
-        matches = f"{before} -> {play(trainer, arguments.matches)}" if arguments.matches else "-"
-        trainer.close()
+        before = after = "-"
+        if arguments.matches:
+            with set_up(cfg, Path(folder)) as setup:
+                before = play(cfg, setup, arguments.matches)
+
+        def watch(state: RunState) -> str | None:
+            nonlocal after
+            is_over = arguments.seconds is not None and state.wall_s >= arguments.seconds
+            if arguments.matches and (is_over or state.agent_steps >= cfg.max_steps):
+                after = play(cfg, state.setup, arguments.matches)
+            return "finished" if is_over else None
+
+        outcome = train(cfg, Path(folder), after_iteration=watch)
+        matches = f"{before} -> {after}" if arguments.matches else "-"
         with open(Path(folder) / "metrics.csv", newline="") as file:
             rows = list(csv.DictReader(file))
     reached = next((row for row in rows if float(row["return_mean"]) >= arguments.goal), None)
@@ -75,22 +86,11 @@ def run(arguments: argparse.Namespace, variant: str, seed: int) -> str:
     )
 
 
-class BudgetTrainer(Trainer):
-    """A trainer that also ends when its wall-clock budget is over."""
-
-    seconds: float | None = None
-
-    def _status(self) -> str | None:
-        if self.seconds is not None and self.wall_s >= self.seconds:
-            return "finished"
-        return super()._status()
-
-
-def play(trainer: Trainer, count: int) -> str:
+def play(cfg: Config, setup: TrainingSetup, count: int) -> str:
     """Play matches of the trained policy against a random side."""
-    actors = {name: learner.actor for name, learner in trainer.learners.items()}
-    player = ActorPolicy(describe_policies(trainer.env), actors, False, "the policy")
-    scores = play_matches(make_env_function(trainer.cfg.env), player, RandomPolicy(1), count, seed=1)
+    actors = {name: learner.actor for name, learner in setup.learners.items()}
+    player = ActorPolicy(describe_policies(setup.env), actors, False, "the policy")
+    scores = play_matches(make_env_function(cfg.env), player, RandomPolicy(1), count, seed=1)
     figures = match_figures(scores)
     return "; ".join(
         f"{name}: {side['wins']} won {side['losses']} lost {side['draws']} drawn"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import signal
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,7 +19,8 @@ from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.scenes import make_scene, scene_names
 from mappo_unity.scenes.core.contract import check_env
-from mappo_unity.training.trainer import Outcome, Trainer
+from mappo_unity.training.run_state import RunState
+from mappo_unity.training.trainer import Outcome, train
 
 ROOT = Path(__file__).resolve().parents[1]
 AREAS = 2
@@ -79,21 +79,11 @@ def test_unknown_and_bad_parameters_are_refused(name: str) -> None:
 
 def run_until(config: Config, folder: Path, iteration: int, resume_from: Path | None = None) -> Outcome:
     """Train up to an iteration and stop as a signal would; the schedules look at max_steps, not at this."""
-    trainer = Trainer(config, folder)
-    iterate = trainer.iterate
 
-    def counted(batches: Any) -> None:
-        iterate(batches)
-        if trainer.iteration == iteration:
-            trainer.stop_signal = signal.SIGINT
+    def stop(state: RunState) -> str | None:
+        return "interrupted" if state.iteration == iteration else None
 
-    trainer.iterate = counted  # type: ignore[method-assign]
-    try:
-        if resume_from is not None:
-            trainer.load(resume_from)
-        return trainer.run()
-    finally:
-        trainer.close()
+    return train(config, folder, resume_from, after_iteration=stop)
 
 
 @every_scene

@@ -21,7 +21,7 @@ from mappo_unity.config.compose import (
 )
 from mappo_unity.config.option_table import option_table
 from mappo_unity.config.overrides import given, shell_argument
-from mappo_unity.config.per_behavior import options_of
+from mappo_unity.config.per_behavior import behavior_config
 from mappo_unity.config.presets import conf_dir
 from mappo_unity.config.schema import Activation, Config, ConfigError, EvalConfig, LogBackend
 from mappo_unity.runs.folder import CONFIG, write_record
@@ -120,7 +120,7 @@ def test_behaviors_may_have_any_name() -> None:
         "My Ball": {"ppo": {"optimizer": "adamw"}},
         "Goalie": {"ppo": {"lr": 0.1}},
     }
-    model, ppo = options_of(config, "3DBall")
+    model, ppo = behavior_config(config, "3DBall")
     assert (model.hidden, ppo.lr, ppo.gamma) == ([8, 4], 2e-4, 0.9)
 
 

@@ -18,8 +18,8 @@ from mappo_unity.policies.episodes import play
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.scenes import make_scene
-from mappo_unity.training.collect import make_collector
-from mappo_unity.training.crashed_episodes import drop_episodes, episode_rows
+from mappo_unity.training.crashed_episodes import episode_rows, mask_crashed_episodes
+from mappo_unity.training.setup import make_collector
 
 FAKE = "Fake?team=0"
 
@@ -78,7 +78,7 @@ def test_a_cut_episode_neither_counts_nor_is_learned_from() -> None:
     truncated = batch["next", "Fake", "truncated"].reshape(5, 2)
     assert truncated.tolist() == [[False] * 2] * 2 + [[True, True]] + [[False] * 2] * 2
     # row t holds the decisions of result t: agent 0's cut episode is rows 1 and 2, agent 1's rows 0 to 2
-    assert drop_episodes(batch, cuts, env) == 2 + 3
+    assert mask_crashed_episodes(batch, cuts, env) == 2 + 3
     assert batch["Fake", "acting"].reshape(5, 2).T.tolist() == [
         [True, False, False, True, True],
         [False, False, False, True, True],
@@ -123,7 +123,7 @@ def test_drops_reach_batches_of_the_collector() -> None:
     base.breaks_at, base.cut = 8, (1,)
     base.script[8] = [Record(1, ends="interrupted"), Record(0), Record(1)]
     batch = next(batches)
-    dropped = drop_episodes(batch, env.pop_cut_off(), env)
+    dropped = mask_crashed_episodes(batch, env.pop_cut_off(), env)
     assert dropped == 3  # results 5, 6 and 7 are rows 0 to 2 of the second batch
     assert batch["Fake", "acting"].reshape(5, 2).T.tolist() == [[True] * 5, [False] * 3 + [True] * 2]
     collector.shutdown()
@@ -178,8 +178,8 @@ def test_past_the_limit_there_is_a_checkpoint_and_exit_code_3(tmp_path: Path, ca
 def test_runs_without_players_have_no_such_columns(tmp_path: Path) -> None:
     from test_train import options
 
-    from mappo_unity.training.trainer import Trainer
+    from mappo_unity.training.run_state import RunState
+    from mappo_unity.training.setup import set_up
 
-    trainer = Trainer(options(1), tmp_path)
-    assert trainer._drop_cut_off(next(iter(trainer.make_collector()))) == {}
-    trainer.close()
+    with set_up(options(1), tmp_path) as setup, setup.collecting() as batches:
+        assert RunState(options(1), tmp_path, setup).mask_crashed(next(batches)) == {}

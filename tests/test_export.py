@@ -23,7 +23,7 @@ from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import write_record
 from mappo_unity.scenes import make_scene
-from mappo_unity.training.trainer import Trainer, train
+from mappo_unity.training.trainer import train
 
 AREAS, ROUNDS = 4, 16
 
@@ -137,9 +137,7 @@ def test_a_failed_export_is_one_line_and_ends_no_run(tmp_path, monkeypatch):
     monkeypatch.setattr(export, "export_checkpoint", fail)
     messages = []
     monkeypatch.setattr("mappo_unity.runs.logger.RunLog.message", lambda self, text: messages.append(text))
-    trainer = Trainer(options(3), tmp_path)
-    outcome = trainer.run()
-    trainer.close()
+    outcome = train(options(3), tmp_path)
     assert outcome.status == "finished" and outcome.agent_steps == 3 * AREAS * ROUNDS
     assert outcome.last_checkpoint is not None and outcome.last_checkpoint.is_file()
     assert len(messages) == 1 and messages[0].endswith("(the run goes on): a new failure")

@@ -16,13 +16,13 @@ from mappo_unity.config.schema import (
     PPOConfig,
     Schedule,
 )
-from mappo_unity.training.trainer import Trainer
+from mappo_unity.training.setup import entries_of, set_up
 
 GAMMA = 0.9
 
 
 def learn(probe, tmp_path, iterations=60, actions="discrete", model=None, ppo=None, rounds=8):
-    """Train on a probe; return the trainer and the last batch."""
+    """Train on a probe; return what was set up and the last batch."""
     cfg = Config(
         env=EnvConfig(
             name="custom",
@@ -48,16 +48,15 @@ def learn(probe, tmp_path, iterations=60, actions="discrete", model=None, ppo=No
         log=LogConfig(backends=[], progress=False),
         max_steps=10**9,
     )
-    trainer = Trainer(cfg, tmp_path)
-    batches = iter(trainer.make_collector())
-    for _ in range(iterations):
-        batch = trainer.entries(next(batches), "Probe")
-        trainer.learners["Probe"].learn(batch, 0.0)
-    return trainer, trainer.entries(next(batches), "Probe")
+    with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
+        for _ in range(iterations):
+            batch = entries_of(next(batches), "Probe")
+            setup.learners["Probe"].learn(batch, 0.0)
+        return setup, entries_of(next(batches), "Probe")
 
 
-def values(trainer, batch):
-    return trainer.learners["Probe"]._values(batch).squeeze(-1)
+def values(setup, batch):
+    return setup.learners["Probe"]._values(batch).squeeze(-1)
 
 
 def chosen(batch, actions="discrete"):
@@ -71,19 +70,19 @@ def chosen(batch, actions="discrete"):
 
 
 def test_constant_reward(tmp_path):
-    trainer, batch = learn("Constant", tmp_path, 30)
-    assert values(trainer, batch).mean().item() == pytest.approx(1.0, abs=0.02)
+    setup, batch = learn("Constant", tmp_path, 30)
+    assert values(setup, batch).mean().item() == pytest.approx(1.0, abs=0.02)
 
 
 def test_reward_that_depends_on_the_observation(tmp_path):
-    trainer, batch = learn("ObsReward", tmp_path, 40)
-    assert torch.allclose(values(trainer, batch), batch["observation"].squeeze(-1), atol=0.06)
+    setup, batch = learn("ObsReward", tmp_path, 40)
+    assert torch.allclose(values(setup, batch), batch["observation"].squeeze(-1), atol=0.06)
 
 
 def test_delayed_reward_is_discounted(tmp_path):
-    trainer, batch = learn("Delayed", tmp_path, 80)
+    setup, batch = learn("Delayed", tmp_path, 80)
     early = batch["observation"].squeeze(-1) == 0
-    value = values(trainer, batch)
+    value = values(setup, batch)
     assert value[early].mean().item() == pytest.approx(GAMMA, abs=0.03)
     assert value[~early].mean().item() == pytest.approx(1.0, abs=0.03)
 
@@ -114,9 +113,9 @@ def test_credit_goes_to_the_member_that_earned_it(tmp_path, shared):
 
 @pytest.mark.parametrize("kind", list(CriticKind))
 def test_only_critics_that_see_the_team_know_what_a_mate_knows(tmp_path, kind):
-    trainer, batch = learn("MateKnows", tmp_path, 80, model={"critic": kind})
+    setup, batch = learn("MateKnows", tmp_path, 80, model={"critic": kind})
     sign = batch["observation"][..., 0, 0]
-    error = (values(trainer, batch)[..., 1] - sign).abs().mean().item()
+    error = (values(setup, batch)[..., 1] - sign).abs().mean().item()
     if kind is CriticKind.local:
         assert error == pytest.approx(1.0, abs=0.1)
     else:
@@ -143,9 +142,9 @@ def test_an_agent_that_is_asked_every_other_round(tmp_path):
 
 
 def test_an_agent_whose_id_changes(tmp_path):
-    trainer, batch = learn("NewIds", tmp_path, 60)
+    setup, batch = learn("NewIds", tmp_path, 60)
     assert (batch["observation"].squeeze(-1) * chosen(batch)).mean() > 0.9
-    assert min(trainer.env.behaviors["Probe?team=0"].slots.agent_id) > 16
+    assert min(setup.env.behaviors["Probe?team=0"].slots.agent_id) > 16
 
 
 @pytest.mark.parametrize(
@@ -156,8 +155,8 @@ def test_an_agent_whose_id_changes(tmp_path):
     ],
 )
 def test_time_limits_bootstrap_and_real_ends_do_not(tmp_path, probe, expected):
-    trainer, batch = learn(probe, tmp_path, 150, rounds=10)
-    assert values(trainer, batch).mean().item() == pytest.approx(expected, rel=0.06)
+    setup, batch = learn(probe, tmp_path, 150, rounds=10)
+    assert values(setup, batch).mean().item() == pytest.approx(expected, rel=0.06)
 
 
 def test_every_probe_is_tested():

@@ -10,9 +10,10 @@ from mappo_unity.config.schema import ConfigError
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import CONFIG
 from mappo_unity.runs.logger import RunLog
-from mappo_unity.training import memory
-from mappo_unity.training import trainer as training
+from mappo_unity.training import memory, stop_signals
 from mappo_unity.training.memory import check_free, is_out_of_memory, show_size
+from mappo_unity.training.run_state import RunState
+from mappo_unity.training.setup import TrainingSetup
 
 ITERATION = 16 * 16  # decisions: 16 rounds of 16 agents
 FAILING = [
@@ -66,14 +67,16 @@ def test_an_environment_that_fails_costs_no_iteration(how, code, said, capfd):
 
 
 def test_a_bug_of_ours_is_saved_from_too(monkeypatch, capfd):
-    learn = training.Trainer._learn
+    learn = TrainingSetup.learn
+    calls = []
 
-    def broken(trainer, batch):
-        if trainer.iteration == 2:
+    def broken(setup, batch, progress):
+        calls.append(1)
+        if len(calls) == 3:
             raise AssertionError("a bug of ours")
-        return learn(trainer, batch)
+        return learn(setup, batch, progress)
 
-    monkeypatch.setattr(training.Trainer, "_learn", broken)
+    monkeypatch.setattr(TrainingSetup, "learn", broken)
     with pytest.raises(AssertionError, match="a bug of ours"):
         train_main([*BASIC, "max_steps=5000", "checkpoint_interval=1000000"])
     assert saved_iterations() == [1, 2]
@@ -83,16 +86,16 @@ def test_a_bug_of_ours_is_saved_from_too(monkeypatch, capfd):
 def test_what_a_rescue_saved_goes_on_as_if_nothing_had_been(monkeypatch):
     arguments = [*BASIC, f"max_steps={5 * ITERATION}", "checkpoint_interval=1000000"]
     assert train_main([*arguments, "hydra.run.dir=whole"]) == 0
-    collect = training.Trainer._drop_cut_off
+    collect = RunState.mask_crashed
     calls = []
 
-    def broken(trainer, batch):
+    def broken(state, batch):
         calls.append(1)
         if len(calls) == 3:  # after a batch was collected: the scene and the random numbers have moved on
             raise AssertionError("a bug of ours")
-        return collect(trainer, batch)
+        return collect(state, batch)
 
-    monkeypatch.setattr(training.Trainer, "_drop_cut_off", broken)
+    monkeypatch.setattr(RunState, "mask_crashed", broken)
     with pytest.raises(AssertionError):
         train_main(arguments)
     assert train_main(["resume=run"]) == 0
@@ -122,15 +125,17 @@ def test_a_checkpoint_that_cannot_be_written_either_is_said_beside_the_reason(mo
     def full(path, state):
         raise checkpoint.CheckpointError(f"checkpoint {path} could not be written")
 
-    learn = training.Trainer._learn
+    learn = TrainingSetup.learn
+    calls = []
 
-    def broken(trainer, batch):
-        if trainer.iteration == 2:
+    def broken(setup, batch, progress):
+        calls.append(1)
+        if len(calls) == 3:
             monkeypatch.setattr(checkpoint, "save", full)
             raise ConfigError("the first reason")
-        return learn(trainer, batch)
+        return learn(setup, batch, progress)
 
-    monkeypatch.setattr(training.Trainer, "_learn", broken)
+    monkeypatch.setattr(TrainingSetup, "learn", broken)
     assert train_main([*BASIC, "max_steps=5000", "checkpoint_interval=1000000"]) == 2
     out, errors = capfd.readouterr()
     assert "the first reason" in errors and "could not be written" in out
@@ -148,7 +153,7 @@ def test_the_first_checkpoint_comes_after_the_first_iteration_and_leaves_the_rhy
 
 
 def test_a_signal_ends_a_batch_that_takes_too_long(monkeypatch, capfd):
-    monkeypatch.setattr(training, "PATIENCE_S", 0.7)
+    monkeypatch.setattr(stop_signals, "PATIENCE_S", 0.7)
     # 1000 rounds of 0.05 s would take 50 s
     long = ["env.params.how=is_terminated", "env.params.at=1100", "collect.rounds=1000"]
     assert train_main([*FAILING, *long]) == 128 + 15
@@ -159,7 +164,7 @@ def test_a_signal_ends_a_batch_that_takes_too_long(monkeypatch, capfd):
 
 
 def test_a_signal_before_the_first_iteration_is_complete_leaves_no_checkpoint(monkeypatch, capfd):
-    monkeypatch.setattr(training, "PATIENCE_S", 0.7)
+    monkeypatch.setattr(stop_signals, "PATIENCE_S", 0.7)
     long = ["env.params.how=is_terminated", "env.params.at=3", "collect.rounds=1000"]
     assert train_main([*FAILING, *long]) == 128 + 15
     assert "no iteration was complete" in capfd.readouterr().out
@@ -230,10 +235,10 @@ def test_a_resume_that_breaks_before_an_iteration_is_complete_leaves_the_options
     assert train_main([*BASIC, "max_steps=512"]) == 0
     before = (folder() / CONFIG).read_bytes()
 
-    def broken(trainer, batch):
+    def broken(setup, batch, progress):
         raise AssertionError("a bug of ours")
 
-    monkeypatch.setattr(training.Trainer, "_learn", broken)
+    monkeypatch.setattr(TrainingSetup, "learn", broken)
     with pytest.raises(AssertionError):
         train_main(["resume=run", "max_steps=2000", "ppo.lr=0.5"])
     assert (folder() / CONFIG).read_bytes() == before
@@ -253,10 +258,10 @@ def test_a_batch_and_networks_that_cannot_fit_are_refused_before_the_first_step(
 
 
 def test_memory_that_runs_out_all_the_same_is_one_line(monkeypatch, capfd):
-    def broken(trainer, batch):
+    def broken(setup, batch, progress):
         torch.empty(2**60)
 
-    monkeypatch.setattr(training.Trainer, "_learn", broken)
+    monkeypatch.setattr(TrainingSetup, "learn", broken)
     assert train_main([*BASIC, "max_steps=512"]) == 2
     assert "memory ran out" in capfd.readouterr().err
 

@@ -7,7 +7,7 @@ from fakes import ScriptedEnv, behavior_spec
 from mlagents_envs.base_env import ActionSpec
 from torchrl.envs.utils import check_env_specs
 
-from mappo_unity.config.per_behavior import check_behaviors, options_of
+from mappo_unity.config.per_behavior import behavior_config, check_behaviors
 from mappo_unity.config.schema import Config, ConfigError, CriticKind, ModelConfig
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
@@ -138,9 +138,9 @@ def test_joint_branches_are_the_same_actions_under_one_categorical():
 
 def test_options_of_one_behavior():
     cfg = Config(behaviors={"Goalie": {"ppo": {"lr": 1e-5}, "model": {"hidden": [7]}}})
-    model, ppo = options_of(cfg, "Goalie")
+    model, ppo = behavior_config(cfg, "Goalie")
     assert (model.hidden, ppo.lr, ppo.gamma) == ([7], 1e-5, cfg.ppo.gamma)
-    assert options_of(cfg, "Striker") == (cfg.model, cfg.ppo)
+    assert behavior_config(cfg, "Striker") == (cfg.model, cfg.ppo)
     check_behaviors(cfg, ["Goalie", "Striker"])
 
 

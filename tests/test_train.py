@@ -28,7 +28,9 @@ from mappo_unity.policies.matches import Score
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.checkpoint import CheckpointError
 from mappo_unity.training import match_series as series
-from mappo_unity.training.trainer import Trainer, train
+from mappo_unity.training import stop_signals
+from mappo_unity.training.setup import TrainingSetup
+from mappo_unity.training.trainer import train
 
 TIMES = {"wall_s", "steps_per_s", "collect_s", "update_s"}
 AREAS, ROUNDS = 6, 20
@@ -106,18 +108,11 @@ def test_the_same_seed_gives_the_same_run(tmp_path):
 def test_four_iterations_are_two_saved_and_two_more_to_the_bit(tmp_path):
     whole = train(options(4), tmp_path / "whole")
     # the schedules look at max_steps, so the first half is cut after two iterations, not shortened
-    trainer = Trainer(options(4), tmp_path / "parts")
-    real_save = trainer.save
-
-    def save_and_stop(best=False):
-        real_save(best)
-        if trainer.iteration == 2:
-            raise KeyboardInterrupt
-
-    trainer.save = save_and_stop
-    with pytest.raises(KeyboardInterrupt):
-        trainer.run()
-    trainer.close()
+    train(
+        options(4),
+        tmp_path / "parts",
+        after_iteration=lambda state: "interrupted" if state.iteration == 2 else None,
+    )
     path, warnings = checkpoint.newest_good(tmp_path / "parts")
     assert path.name == f"step_{2 * BATCH:012d}.pt" and not warnings
     resumed = train(options(4), tmp_path / "parts", path)
@@ -213,18 +208,18 @@ def test_signals_end_with_a_checkpoint_a_line_and_their_exit_code(tmp_path, numb
 
 
 def test_a_signal_to_the_process_and_to_its_group_is_one(tmp_path, monkeypatch):
-    iterate = Trainer.iterate
+    learn = TrainingSetup.learn
 
-    def signalled(trainer, batches):
+    def signalled(setup, batch, progress):
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
-        iterate(trainer, batches)
+        return learn(setup, batch, progress)
 
-    monkeypatch.setattr(Trainer, "iterate", signalled)
+    monkeypatch.setattr(TrainingSetup, "learn", signalled)
     outcome = train(options(4), tmp_path)
     assert (outcome.status, outcome.signal) == ("interrupted", signal.SIGINT)
     assert outcome.last_checkpoint.is_file()
-    monkeypatch.setattr("mappo_unity.training.trainer.ECHO_S", -1.0)
+    monkeypatch.setattr(stop_signals, "ECHO_S", -1.0)
     with pytest.raises(KeyboardInterrupt):
         train(options(4), tmp_path / "other")
 

@@ -15,7 +15,7 @@ from mappo_unity.learning.actor_critic import JointPolicy, make_actor
 from mappo_unity.learning.distributions import ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
 from mappo_unity.scenes import make_scene
-from mappo_unity.training.collect import make_collector
+from mappo_unity.training.setup import make_collector
 
 END, CUT = "terminated", "interrupted"
 

@@ -30,10 +30,10 @@ def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:
             raise ConfigError(
                 f"behaviors.{name}: the environment has no behavior {name!r}; it has {', '.join(known)}"
             )
-        options_of(cfg, name)
+        behavior_config(cfg, name)
 
 
-def options_of(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
+def behavior_config(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
     """Return the model and learner options of a policy name.
 
     Raises:

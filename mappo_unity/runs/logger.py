@@ -27,10 +27,10 @@ from mappo_unity.runs.progress import Progress
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
 
-__all__ = ["RunLog", "check_backends", "read_metrics"]
+__all__ = ["RunLog", "check_loggers", "read_metrics"]
 
 
-def check_backends(cfg: LogConfig) -> None:
+def check_loggers(cfg: LogConfig) -> None:
     """Raise ConfigError where a logger's package is not installed; quick, imports nothing."""
     for backend in (LogBackend.wandb, LogBackend.mlflow):
         if backend in cfg.backends and importlib.util.find_spec(backend.name) is None:
@@ -61,7 +61,7 @@ class RunLog:
         resume_steps: int | None = None,
         console: Console | None = None,
     ) -> None:
-        check_backends(cfg)
+        check_loggers(cfg)
         metrics = folder / "metrics.csv"
         self._console = console or Console()
         if resume_steps is not None:
@@ -116,6 +116,11 @@ class RunLog:
     def message(self, text: str) -> None:
         """Print a line above the progress line."""
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def message_if_possible(self, text: str) -> None:
+        """Print a line, unless whoever read them is gone or the disk they went to is full."""
+        with suppress(OSError):
+            self.message(text)
 
     def close(self) -> None:
         """Finish the progress line and close files and loggers; again: nothing."""

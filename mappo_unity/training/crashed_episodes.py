@@ -16,7 +16,7 @@ from mappo_unity import keys
 from mappo_unity.envs.unity_env import CutOff, UnityEnv
 
 
-def drop_episodes(batch: TensorDictBase, cuts: Sequence[CutOff], env: UnityEnv) -> int:
+def mask_crashed_episodes(batch: TensorDictBase, cuts: Sequence[CutOff], env: UnityEnv) -> int:
     """Set `acting` and `departed` to False in every row of the cut episodes; return how many rows acted.
 
     Args:

@@ -15,7 +15,7 @@ from mappo_unity import keys
 from mappo_unity.envs.rounds import Episode
 
 
-class EpisodeWindow:
+class RecentEpisodes:
     """The newest finished episodes of every behavior."""
 
     def __init__(self, size: int, behaviors: list[str]) -> None:

@@ -24,7 +24,7 @@ def describe_policies(env: UnityEnv) -> dict[str, Any]:
     return out
 
 
-def check_fits(
+def check_compatible(
     path: Path, state: dict[str, Any], env_name: str, layout: dict[str, Any], models: dict[str, Any]
 ) -> None:
     """Refuse a checkpoint of another environment or network, saying what differs."""
@@ -37,11 +37,11 @@ def check_fits(
             f"checkpoint {path} was written for policies {state['layout']}, but the environment has {layout}"
         )
     different = []
+    defaults = plain(asdict(ModelConfig()))
     for name, model in models.items():
-        saved = state["model"][name]
-        different += [
-            f"model.{k}={saved.get(k)} there, {v} here" for k, v in model.items() if saved.get(k) != v
-        ]
+        # an option that the checkpoint does not know yet had its default's effect
+        saved = defaults | state["model"][name]
+        different += [f"model.{k}={saved[k]} there, {v} here" for k, v in model.items() if saved[k] != v]
     if different:
         raise CheckpointError(f"checkpoint {path} holds another network: {'; '.join(different)}")
 

@@ -1,0 +1,177 @@
+"""The state of a training run: everything that a checkpoint holds.
+
+In: what is trained (`TrainingSetup`), a checkpoint's entries. Out: counters, metrics, a ``state_dict``.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from mappo_unity.config.per_behavior import behavior_config
+from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.policies.export import sample_inputs
+from mappo_unity.runs import checkpoint
+from mappo_unity.runs.rng import get_rng_state, set_rng_state
+from mappo_unity.training.crashed_episodes import mask_crashed_episodes
+from mappo_unity.training.episode_stats import RecentEpisodes, count_decisions
+from mappo_unity.training.match_series import MatchSeries
+from mappo_unity.training.resume_check import check_compatible, describe_models, describe_policies
+from mappo_unity.training.setup import TrainingSetup
+
+_COUNTERS = (
+    *("iteration", "agent_steps", "wall_s", "saved_at", "best_score"),
+    *("restarts_before", "dropped_episodes", "dropped_steps"),
+)
+
+
+class RunState:
+    """Counters, recent episodes, matches and the learners of a run.
+
+    Args:
+        cfg: the run's options.
+        folder: the run's folder.
+        setup: what is trained.
+
+    Attributes: `iteration`, how many are complete; `agent_steps`, agent decisions; `wall_s`, seconds spent
+    collecting and learning; `saved_at`, agent decisions at the last regular checkpoint; `best_score`, of the
+    best checkpoint; `dropped_episodes` and `dropped_steps`, what crashed players cost; `samples`, inputs of
+    each policy that an export is compared on.
+    """
+
+    def __init__(self, cfg: Config, folder: Path, setup: TrainingSetup) -> None:
+        self.cfg, self.setup = cfg, setup
+        self.iteration = self.agent_steps = self.saved_at = 0
+        self.wall_s = 0.0
+        self.best_score = -math.inf
+        self.restarts_before = self.dropped_episodes = self.dropped_steps = 0
+        self.recent_episodes = RecentEpisodes(cfg.log.return_window, list(setup.env.behaviors))
+        self.matches = MatchSeries(cfg, folder, setup.env.behaviors)
+        self.samples: dict[str, dict[str, torch.Tensor]] = {}
+        self._rng_state: dict[str, Any] | None = None  # of the checkpoint that is resumed
+
+    @property
+    def restarts(self) -> int:
+        """How often players were started again in this run."""
+        return self.restarts_before + (self.setup.env.restarts or 0)
+
+    @property
+    def updates(self) -> dict[str, tuple[int, int]]:
+        """For each policy name: how many updates were rolled back, and how many there were."""
+        learners = self.setup.learners
+        return {name: (learner.rollbacks, learner.updates) for name, learner in learners.items()}
+
+    def mask_crashed(self, batch: TensorDictBase) -> dict[str, float]:
+        """Take the episodes that crashed players cut off out of the batch; return what they cost so far."""
+        env = self.setup.env
+        if env.restarts is None:
+            return {}
+        crashed = env.pop_cut_off()
+        self.dropped_steps += mask_crashed_episodes(batch, crashed, env)
+        self.dropped_episodes += sum(int(cut.slots.sum()) for cut in crashed)
+        return {
+            "restarts": float(self.restarts),
+            "dropped_episodes": float(self.dropped_episodes),
+            "dropped_steps": float(self.dropped_steps),
+        }
+
+    def count(self, batch: TensorDictBase, collect_s: float, update_s: float) -> dict[str, float]:
+        """Count an iteration; return its metrics but those of learning.
+
+        Args:
+            batch: what was collected.
+            collect_s, update_s: seconds that collecting and learning took.
+        """
+        learners, seconds = self.setup.learners, collect_s + update_s
+        steps = count_decisions(batch, list(learners))
+        self.samples = {
+            name: sample_inputs(batch.get(name), learner.actor.in_keys) for name, learner in learners.items()
+        }
+        self.iteration += 1
+        self.agent_steps += steps
+        self.wall_s += seconds
+        episodes_new = self.recent_episodes.add(self.setup.env.pop_episodes())
+
+        counters = {"iteration": self.iteration, "agent_steps": self.agent_steps, "wall_s": self.wall_s}
+        episodes = {"episodes": self.recent_episodes.total, "episodes_new": episodes_new}
+        times = {"steps_per_s": steps / seconds, "collect_s": collect_s, "update_s": update_s}
+        return counters | episodes | self.recent_episodes.summary() | times
+
+    def play_matches(self) -> dict[str, float]:
+        """Play a series of matches where one is due, and return its figures."""
+        if not self.matches.is_due(self.agent_steps):
+            return {}
+        actors = {name: learner.actor for name, learner in self.setup.learners.items()}
+        return self.matches.play(self.agent_steps, self._layout(), actors)
+
+    def score(self) -> float:
+        """Return what the best checkpoint is chosen by: return_mean; where there are two sides, the matches.
+
+        There one side's gain is the other's loss, and the mean return says nothing.
+        """
+        if self.matches.two_sided:
+            return self.matches.score(self.agent_steps)
+        return self.recent_episodes.summary()["return_mean"]
+
+    # --- checkpoints
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that resuming needs, between two iterations; what is trained is copied."""
+        learners = {name: learner.state_dict() for name, learner in self.setup.learners.items()}
+        return {
+            "env_name": self.cfg.env.name,
+            "model": self._models(),
+            "layout": self._layout(),
+            "learners": copy.deepcopy(learners),
+            "env": self.setup.env.get_state(),
+            "window": self.recent_episodes.state_dict(),
+            "matches": self.matches.state_dict(),
+            "rng": get_rng_state(),
+            "samples": self.samples,
+            **{name: getattr(self, name) for name in _COUNTERS},
+            "restarts_before": self.restarts,
+        }
+
+    def load(self, path: Path) -> None:
+        """Go on from a checkpoint; `restore_rng` follows when everything is built.
+
+        Raises:
+            CheckpointError: it belongs to another environment or other networks.
+        """
+        state = checkpoint.load(path)
+        check_compatible(path, state, self.cfg.env.name, self._layout(), self._models())
+        for name, learner in self.setup.learners.items():
+            learner.load_state_dict(state["learners"][name])
+        if state["env"] is not None:
+            self._restore_env(path, checkpoint.to_arrays(state["env"]))
+        self.recent_episodes.load_state_dict(state["window"])
+        self.matches.load_state_dict(state["matches"])
+        for name in _COUNTERS:
+            setattr(self, name, state[name])
+        self.samples = state.get("samples", {})
+        self._rng_state = state["rng"]
+
+    def restore_rng(self) -> None:
+        """Set the random generators as the resumed checkpoint has them: last, since building draws too."""
+        if self._rng_state is not None:
+            set_rng_state(self._rng_state)
+
+    def _restore_env(self, path: Path, state: dict[str, Any]) -> None:
+        try:
+            self.setup.env.set_state(state)
+        except ConfigError as error:
+            raise checkpoint.CheckpointError(
+                f"checkpoint {path} does not fit the environment's options, which cannot change with resume: "
+                f"{error}"
+            ) from error
+
+    def _layout(self) -> dict[str, Any]:
+        return describe_policies(self.setup.env)
+
+    def _models(self) -> dict[str, Any]:
+        return describe_models({name: behavior_config(self.cfg, name)[0] for name in self.setup.learners})

@@ -1,0 +1,113 @@
+"""When checkpoints are written: regularly, when the policy is the best so far, and when anything breaks in.
+
+In: the run's state after each complete iteration. Out: files; a line where an error ended the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mappo_unity.config.overrides import shell_argument
+from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.policies.export import RunExports
+from mappo_unity.runs import checkpoint
+from mappo_unity.training.run_state import RunState
+
+
+class CheckpointSaver:
+    """Keep the last complete iteration of a run, and write it when it is time.
+
+    Args:
+        cfg: the run's options.
+        folder: the run's folder.
+        state: of the run.
+        exports: told when the best checkpoint changed; None: no exports.
+        last: the checkpoint that is resumed.
+    """
+
+    def __init__(
+        self, cfg: Config, folder: Path, state: RunState, exports: RunExports | None, last: Path | None
+    ) -> None:
+        self._cfg, self._folder, self._state, self._exports = cfg, folder, state, exports
+        self.last = last
+        self._resumed = last is not None
+        self._saved_iteration = state.iteration if last else None
+        self._complete: dict[str, Any] | None = None  # the last iteration that this process completed
+
+    @property
+    def best(self) -> Path | None:
+        """The best checkpoint, where there is one."""
+        path = self._folder / checkpoint.FOLDER / checkpoint.BEST
+        return path if path.exists() else None
+
+    def complete(self) -> None:
+        """Keep the state of the iteration that is just complete."""
+        self._complete = self._state.state_dict()
+
+    def complete_matches(self) -> None:
+        """Take the series of matches that was played after `complete` into what is kept."""
+        assert self._complete is not None
+        self._complete["matches"] = self._state.matches.state_dict()
+
+    def save_if_due(self, won: bool) -> None:
+        """Save after the first iteration, at the regular interval, or where these weights won a series.
+
+        Args:
+            won: the iteration's series of matches is at least as good as the best one before.
+        """
+        state = self._state
+        is_over = state.agent_steps - state.saved_at >= self._cfg.checkpoint_interval
+        if won or is_over or self.last is None:
+            self.save(won)
+
+    def save(self, best: bool = False) -> None:
+        """Write a checkpoint of the last complete iteration, unless there is one.
+
+        Args:
+            best: call it the best one though its score is only as good as the best before.
+
+        Raises:
+            CheckpointError: it cannot be written.
+        """
+        complete, state = self._complete, self._state
+        if complete is None or complete["iteration"] == self._saved_iteration:
+            return
+
+        score = state.score()
+        best = best or score > state.best_score
+        if best:
+            state.best_score = score
+        if self.last is not None:  # the first one comes early and is not part of the rhythm
+            state.saved_at = complete["agent_steps"]
+        complete |= {"best_score": state.best_score, "saved_at": state.saved_at}
+
+        steps, keep = complete["agent_steps"], self._cfg.keep_checkpoints
+        self.last = checkpoint.save_in(self._folder, steps, complete, keep, best)
+        self._saved_iteration = complete["iteration"]
+        if best and self._exports is not None:
+            self._exports.best_changed()
+
+    def finish(self) -> None:
+        """Save what is not saved yet, and export the best and the last checkpoint."""
+        self.save()
+        if self._exports is not None:
+            self._exports.finish(self.last)
+
+    def rescue(self, say: Callable[[str], None]) -> None:
+        """Save the last complete iteration before an error or a second signal ends the run; say where."""
+        try:
+            self.save()
+        except ConfigError as error:
+            say(str(error))
+            return
+
+        if self._complete is not None:
+            iteration, steps = self._complete["iteration"], self._complete["agent_steps"]
+            say(
+                f"saved the last complete iteration, {iteration} ({steps:,} steps): {self.last}; "
+                f"resume with: mappo-train {shell_argument('resume', self._folder)}"
+            )
+        elif not self._resumed:
+            say("no iteration was complete: there is nothing to resume")

@@ -1,0 +1,236 @@
+"""What a training run is made of: the environment, the learners and the collector.
+
+In: `Config`, a run folder. Out: `TrainingSetup`. What an environment has (sensors, actions, teams) is read
+from it; what does not fit into memory is refused before the first step.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, ExplorationType
+
+from mappo_unity.config.per_behavior import behavior_config, check_behaviors
+from mappo_unity.config.schema import CollectConfig, Config, ConfigError, ModelConfig, PPOConfig
+from mappo_unity.envs.backends import make_env_function
+from mappo_unity.envs.transforms import transformed
+from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.learning.actor_critic import JointPolicy, make_actor, make_critic
+from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
+from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.learning.ppo import PolicyLearner
+from mappo_unity.runs.folder import PLAYERS
+from mappo_unity.runs.logger import check_loggers
+from mappo_unity.runs.rng import seed_everything
+from mappo_unity.training.memory import check_free, show_size
+
+BATCH_COPIES = 6
+"""Memory of a batch in units of its observations: as they were and as next ones, as rounds and as a stack of
+them, and the rows that are learnt with what the networks make of them."""
+WEIGHT_COPIES = 10
+"""Memory of learning in units of the weights: gradients, two moments of Adam, and two copies of weights and
+moments, to roll an update back and to save the last complete iteration."""
+
+
+class TrainingSetup:
+    """The environment, and a learner for every policy name.
+
+    Args:
+        cfg: the run's options.
+        env: the environment, open.
+
+    Attributes: `learners` by policy name; `policy`, their actors as one; `rounds` of a batch; `notes`, lines
+    for the user.
+
+    Raises:
+        ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
+    """
+
+    def __init__(self, cfg: Config, env: UnityEnv) -> None:
+        self.cfg, self.env = cfg, env
+        self.notes = [f"note: {cfg.env.note}"] if cfg.env.note is not None else []
+        self.rounds = batch_rounds(cfg.collect, env)
+        self.learners = make_learners(cfg, env, self.rounds, self.notes.append)
+        self.policy = JointPolicy({name: learner.actor for name, learner in self.learners.items()})
+
+    @contextmanager
+    def collecting(self) -> Iterator[Iterator[TensorDictBase]]:
+        """Yield endless batches ``[T, ...]``, collected from where the environment stands."""
+        collector = make_collector(transformed(self.env), self.policy, self.rounds, self.cfg.device)
+        try:
+            yield iter(collector)
+        finally:
+            collector.shutdown(close_env=False)
+
+    def learn(self, batch: TensorDictBase, progress: float) -> dict[str, dict[str, float]]:
+        """Improve every policy by a batch; return the metrics of each.
+
+        Args:
+            batch: as collected.
+            progress: share of the run that is over, 0 to 1, for the schedules.
+        """
+        torch.set_num_threads(min(self.cfg.update_threads, os.cpu_count() or 1))
+        metrics = {
+            name: learner.learn(entries_of(batch, name), progress) for name, learner in self.learners.items()
+        }
+        torch.set_num_threads(self.cfg.num_threads)
+        return metrics
+
+
+@contextmanager
+def set_up(cfg: Config, folder: Path) -> Iterator[TrainingSetup]:
+    """Open the environment and build what learns; close the environment at the end of the block.
+
+    Args:
+        cfg: the run's options.
+        folder: the run's folder; players log below it.
+
+    Raises:
+        ConfigError: see `TrainingSetup`; the device or a logger is not there.
+    """
+    prepare_torch(cfg)
+    check_loggers(cfg.log)
+    env = make_unity_env(cfg, folder)
+    try:
+        yield TrainingSetup(cfg, env)
+    finally:
+        if not env.is_closed:
+            env.close()
+
+
+def prepare_torch(cfg: Config) -> None:
+    """Set threads and seeds; check the device."""
+    torch.set_num_threads(cfg.num_threads)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every storage
+    if cfg.device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError(f"device={cfg.device}: this torch finds no CUDA device; use device=cpu")
+    seed_everything(cfg.seed)
+
+
+def make_unity_env(cfg: Config, folder: Path) -> UnityEnv:
+    """Open the environment of the options behind the adapter; players log below the run's folder."""
+    return UnityEnv(
+        make_env_function(cfg.env, folder / PLAYERS),
+        cfg.seed,
+        action_limit=CONTINUOUS_LIMIT,
+        max_team_size=cfg.env.max_team_size,
+        max_teams=cfg.env.max_teams,
+        death_masking=cfg.ppo.death_masking,
+    )
+
+
+def batch_rounds(cfg: CollectConfig, env: UnityEnv) -> int:
+    """Return the rounds of a batch, for the agents that the environment began with."""
+    if cfg.rounds is not None:
+        return cfg.rounds
+    agents = sum(int(behavior.present.sum()) for behavior in env.behaviors.values())
+    return -(-cfg.batch_size // max(1, agents))
+
+
+def make_collector(env: EnvBase, policy: JointPolicy, rounds: int, device: str = "cpu") -> Collector:
+    """Build a collector of endless batches of so many rounds, on the networks' device."""
+    devices = {"policy_device": device, "env_device": "cpu", "storing_device": device}
+    return Collector(
+        env,
+        policy,
+        frames_per_batch=rounds,
+        total_frames=-1,
+        exploration_type=ExplorationType.RANDOM,
+        track_traj_ids=False,
+        use_buffers=False,  # a batch is a new stack of its rounds,
+        return_same_td=device == "cpu",  # so that nothing has to be copied out of it
+        trust_policy=True,
+        auto_register_policy_transforms=False,
+        **({} if device == "cpu" else devices),
+    )
+
+
+def entries_of(batch: TensorDictBase, name: str) -> TensorDictBase:
+    """Return one policy name's entries of a batch, with its own ``next``."""
+    entries = batch.get(name).copy()
+    entries.set("next", batch.get(("next", name)))
+    return entries
+
+
+def make_learners(
+    cfg: Config, env: UnityEnv, rounds: int, note: Callable[[str], None]
+) -> dict[str, PolicyLearner]:
+    """Build networks and learner of every policy name.
+
+    Args:
+        cfg: the run's options.
+        env: what is played.
+        rounds: of a batch.
+        note: takes a line for the user about an option that does not fit and follows another.
+
+    Raises:
+        ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
+    """
+    check_behaviors(cfg, env.sides)
+    check_batch_memory(cfg, env, rounds)
+    learners = {}
+    for name, sides in env.sides.items():
+        model, ppo = behavior_config(cfg, name)
+        behavior = env.behaviors[sides[0]]
+        teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
+        check_minibatches(name, ppo, rounds, teams, team_size, note)
+
+        obs = ObsLayout.from_specs(behavior.spec.observation_specs)
+        layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
+        check_network_memory(name, obs, layout, team_size, model)
+        actor = make_actor(obs, layout, team_size, model).to(cfg.device)
+        critic = make_critic(obs, team_size, model).to(cfg.device)
+        learners[name] = PolicyLearner(actor, critic, ppo, rounds * teams, team_size)
+    return learners
+
+
+def check_minibatches(
+    name: str, ppo: PPOConfig, rounds: int, teams: int, team_size: int, note: Callable[[str], None]
+) -> None:
+    """Note a minibatch larger than the batch; raise ConfigError for more minibatches than team rows."""
+    rows, agents = rounds * teams, teams * team_size
+    if (ppo.num_minibatches or 0) > rows:
+        raise ConfigError(
+            f"ppo.num_minibatches={ppo.num_minibatches} is larger than the batch of {name!r}: {rounds} "
+            f"rounds x {teams} teams = {rows} team rows; lower ppo.num_minibatches, or raise "
+            "collect.batch_size (or collect.rounds, where it is given)"
+        )
+    if ppo.num_minibatches is None and ppo.minibatch_size > rows * team_size:
+        note(
+            f"note: ppo.minibatch_size={ppo.minibatch_size} is larger than the batch of {name}: {rounds} "
+            f"rounds x {agents} agents = {rows * team_size} decisions, learnt as one minibatch"
+        )
+
+
+def check_batch_memory(cfg: Config, env: UnityEnv, rounds: int) -> None:
+    """Raise ConfigError if a batch does not fit into the memory that is free."""
+    option = "batch_size" if cfg.collect.rounds is None else "rounds"
+    value = getattr(cfg.collect, option)
+    one_round = env.root().bytes()
+    check_free(
+        BATCH_COPIES * one_round * rounds,
+        f"collect.{option}={value}: learning from a batch of {rounds:,} rounds of {show_size(one_round)}",
+        f"lower collect.{option}, or env.num_areas where the environment has it",
+    )
+
+
+def check_network_memory(
+    name: str, obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig
+) -> None:
+    """Raise ConfigError if a policy's networks do not fit into the memory that is free."""
+    with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers
+        nets = make_actor(obs, layout, team_size, cfg), make_critic(obs, team_size, cfg)
+    size = sum(p.numel() * p.element_size() for net in nets for p in net.parameters())
+    check_free(
+        WEIGHT_COPIES * size,
+        f"model.hidden={list(cfg.hidden)}, critic {list(cfg.critic_hidden or cfg.hidden)}: learning the "
+        f"networks of {name} ({show_size(size)})",
+        "lower model.hidden or model.critic_hidden",
+    )
