@@ -59,7 +59,7 @@ def played(name: str) -> Any:
 def picture(name: str) -> np.ndarray:
     """Return the picture uint8 [height, width, 3] of a scene."""
     scene, drawing = played(name), drawing_of(name)
-    camera = drawing.camera(scene, 0) if callable(drawing.camera) else drawing.camera
+    camera = drawing.view(scene, 0)
     renderer = Renderer(camera, *SIZE)
     try:
         return renderer.frame(drawing.shapes(scene, 0), camera)

@@ -1,4 +1,4 @@
-"""Where things are in pictures; what a film holds."""
+"""Where things are in pictures; what a video holds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def where(frame: np.ndarray, color: Color) -> tuple[float, float, int]:
 
 
 def frames_of(path: Path) -> list[np.ndarray]:
-    """Return the frames of a film."""
+    """Return the frames of a video."""
     if path.suffix == ".gif":
         with importlib.import_module("PIL.Image").open(path) as image:
             pages = importlib.import_module("PIL.ImageSequence").Iterator(image)

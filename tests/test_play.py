@@ -7,6 +7,7 @@ import os
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from films import CAMERA, SIZE, frames_of
 
@@ -29,14 +30,14 @@ from mappo_unity.scenes.core.shapes import RED, ball
 from mappo_unity.scenes.drawings import drawing_of
 
 
-def test_films_run_at_the_pace_of_their_scene() -> None:
+def test_videos_run_at_the_pace_of_their_scene() -> None:
     pace = Pace(drawing_of("3DBall"), seconds=4)  # ticks of 0.02 s, two a frame
     assert (pace.ticks, pace.fps, pace.frames) == (2, pytest.approx(25), 100)
     pace = Pace(drawing_of("Basic"), seconds=3)  # Unity plays Basic at 0.15 s a decision
     assert (pace.ticks, pace.fps, pace.frames) == (1, pytest.approx(1 / 0.15), 20)
 
 
-def test_random_actions_are_filmed(tmp_path: Path, needs_video: None) -> None:
+def test_random_actions_are_shown(tmp_path: Path, needs_video: None) -> None:
     video = tmp_path / "basic.mp4"
     shown = play(PlayConfig(env="Basic", video=str(video), seconds=6, width=96, height=64))
     assert shown["scene"] == "Basic" and shown["policy"] == "random" and shown["frames"] == 40
@@ -44,7 +45,18 @@ def test_random_actions_are_filmed(tmp_path: Path, needs_video: None) -> None:
     assert len(frames_of(video)) == 40
 
 
-def test_a_run_is_filmed_from_the_command_line(
+def test_videos_have_a_caption_unless_it_is_unwanted(tmp_path: Path, needs_video: None) -> None:
+    frames = {}
+    for caption in (True, False):
+        video = tmp_path / f"{caption}.gif"
+        play(PlayConfig(env="Basic", video=str(video), seconds=0.5, width=160, height=96, caption=caption))
+        frames[caption] = np.stack(frames_of(video)).astype(int)
+    dark, sky = (frames[caption][:, -20:].mean() for caption in (True, False))
+    assert dark < 0.6 * sky
+    assert np.abs(frames[True][:, :70] - frames[False][:, :70]).mean() < 3  # a GIF's own choice of colours
+
+
+def test_a_run_is_shown_from_the_command_line(
     tmp_path: Path, needs_video: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cfg = Config(
@@ -97,6 +109,8 @@ def test_a_window_shows_frames_at_their_time() -> None:
         (["run=a", "policy=b.onnx"], "both say who plays"),
         (["env=Basic", "width=63"], "width=63 is out of range: width must be even"),
         (["env=Basic", "seconds=0"], "seconds=0.0 is out of range"),
+        (["env=Basic", "caption=perhaps"], "caption=perhaps does not fit: caption must be true or false"),
+        (["env=Basic", "caption="], "caption= does not fit: caption must be true or false"),
         (["env=Basic", "video=film.avi"], "must end in one of"),
         (["env=custom", "video=film.mp4"], "env.factory is not given"),
         (["env=Nope", "video=film.mp4"], "env=Nope does not exist"),

@@ -1,4 +1,4 @@
-"""Films: pictures show what stands where, files are whole or absent."""
+"""Videos: pictures show what stands where, files are whole or absent."""
 
 from __future__ import annotations
 
@@ -12,9 +12,22 @@ from films import CAMERA, SIZE, frames_of, gif_durations_ms, where
 
 from mappo_unity.cli import play_main
 from mappo_unity.config.schema import ConfigError
+from mappo_unity.policies.antialias import smooth_edges
+from mappo_unity.policies.caption import draw_caption
 from mappo_unity.policies.render import Renderer
 from mappo_unity.policies.video import VideoFile, check_video
-from mappo_unity.scenes.core.shapes import BLUE, GREEN, RED, Camera, ball, box, capsule, yaw_rotation
+from mappo_unity.scenes.core.shapes import (
+    BLUE,
+    GREEN,
+    RED,
+    WHITE,
+    Camera,
+    Shape,
+    ball,
+    box,
+    capsule,
+    yaw_rotation,
+)
 
 
 def test_pictures_show_right_up_and_ahead_as_unity_does(renderer: Renderer) -> None:
@@ -162,6 +175,14 @@ def test_videos_that_cannot_be_written_are_refused(tmp_path: Path, monkeypatch: 
         ConfigError, match=r"needs the package imageio_ffmpeg: pip install 'mappo-unity\[video"
     ):
         check_video(tmp_path / "film.mp4")
+    monkeypatch.undo()
+    monkeypatch.setitem(__import__("sys").modules, "PIL", None)
+    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", __import__("types"))
+    check_video(tmp_path / "film.mp4")
+    with pytest.raises(
+        ConfigError, match=r"caption=true needs the package PIL: pip install 'mappo-unity\[vid"
+    ):
+        check_video(tmp_path / "film.mp4", caption=True)
 
 
 def test_a_machine_without_opengl_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,3 +190,85 @@ def test_a_machine_without_opengl_is_told_what_to_install(monkeypatch: pytest.Mo
     monkeypatch.setitem(__import__("sys").modules, "mujoco.osmesa", None)
     with pytest.raises(ConfigError, match=r"OpenGL with osmesa .* apt-get install libegl1 libgl1-mesa-dri"):
         Renderer(CAMERA, *SIZE)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.2, -0.35, 2.5])
+def test_smoothed_edges_are_nearer_to_the_share_of_each_pixel_that_is_covered(slope: float) -> None:
+    fine = np.arange(0, 48, 1 / 8) + 1 / 16  # eight samples a pixel, each way
+    covered = fine[:, None] > 20.3 + slope * (fine[None, :] - 20)
+    share = covered.reshape(48, 8, 48, 8).mean((1, 3))
+    frame = np.where(covered[4::8, 4::8, None], np.uint8([200, 40, 60]), np.uint8([90, 160, 240]))
+    rough = frame.copy()
+    smooth_edges(frame)
+    true = share[..., None] * [200, 40, 60] + (1 - share[..., None]) * [90, 160, 240]
+    inside = np.s_[14:-14, 14:-14]  # both ends of a step within the picture
+    errors = [np.abs(picture - true)[inside].mean() for picture in (rough, frame)]
+    assert errors[1] <= (0.55 if slope else 1) * errors[0]
+    untouched = (share < 0.01) | (share > 0.99)
+    far = np.array(
+        [untouched[max(0, r - 1) : r + 2, max(0, c - 1) : c + 2].all() for r, c in np.ndindex(48, 48)]
+    )
+    assert (frame.reshape(-1, 3)[far] == rough.reshape(-1, 3)[far]).all()
+
+
+def test_a_picture_without_edges_stays_as_it_is() -> None:
+    frame = np.full((64, 64, 3), 90, np.uint8)
+    smooth_edges(frame)
+    assert (frame == 90).all()
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (30.0, 0.0, -40.0)])
+def test_shadows_fall_wherever_the_camera_looks(
+    renderer: Renderer, place: tuple[float, float, float]
+) -> None:
+    floor = box((place[0], -0.1, place[2]), (8, 0.1, 8), WHITE, shadow=False)
+    middle, camera = (place[0], 1.5, place[2]), Camera(place, 12.0, pitch=50.0)
+
+    def darker(thing: Shape) -> int:
+        bare, shown = (renderer.frame(shapes, camera).astype(int) for shapes in ([floor], [floor, thing]))
+        drop = bare - shown
+        return int(((drop > 40) & (np.ptp(shown, axis=-1, keepdims=True) < 20)).all(-1).sum())
+
+    assert darker(box(middle, (1, 1, 1), RED)) > 100
+    assert darker(box(middle, (1, 1, 1), RED, shadow=False)) < 20
+
+
+def test_a_caption_is_a_line_over_the_lower_edge() -> None:
+    pytest.importorskip("PIL")
+    parts = ["SoccerTwos", "12.3 s", "blue 1 : 0 purple"]
+    for width, height in ((960, 544), (480, 272), (160, 96)):
+        frame = np.full((height, width, 3), 120, np.uint8)
+        draw_caption(frame, parts)
+        again = np.full((height, width, 3), 120, np.uint8)
+        draw_caption(again, parts)
+        assert (frame == again).all()
+        changed = np.flatnonzero((frame != 120).any((1, 2)))
+        assert changed[-1] == height - 1 and changed.size == np.ptp(changed) + 1 <= max(26, height / 10)
+        strip = frame[changed[0] :]
+        assert strip.max() > 240 and np.median(strip) < 50  # bright letters on a dark line
+        letters = np.flatnonzero((strip > 200).any((0, 2)))
+        assert letters[0] < 20 and letters[-1] < width - 3
+
+
+def test_what_does_not_fit_into_a_caption_goes_and_the_score_stays() -> None:
+    pytest.importorskip("PIL")
+    parts = ["GridFoodCollector", "1.2 s", "return 0.50", "last episode 3.00"]
+
+    def line(width: int, parts: list[str]) -> bytes:
+        frame = np.full((96, width, 3), 120, np.uint8)
+        draw_caption(frame, parts)
+        return frame.tobytes()
+
+    assert line(1000, parts) != line(1000, parts[:3])
+    assert line(270, parts) == line(270, parts[:3])
+    assert line(150, parts) == line(150, parts[1:3])
+    assert line(80, parts) == line(80, parts[2:3]) != line(80, [""])
+
+
+def test_figures_that_change_do_not_move_what_follows() -> None:
+    pytest.importorskip("PIL")
+    first, second = np.zeros((2, 272, 480, 3), np.uint8)
+    draw_caption(first, ["Basic", "1.1 s", "return 0.50"])
+    draw_caption(second, ["Basic", "8.8 s", "return 0.50"])
+    columns = np.flatnonzero((first != second).any((0, 2)))
+    assert 0 < columns.size <= np.ptp(columns) + 1 < 40

@@ -39,7 +39,7 @@ def eval_main(arguments: list[str] | None = None) -> int:
 
 
 def play_main(arguments: list[str] | None = None) -> int:
-    """Run mappo-play: film a policy in its scene; return the exit code."""
+    """Run mappo-play: show a policy in its scene; return the exit code."""
     return _run_command("mappo-play", _play_command, _play_help, arguments)
 
 

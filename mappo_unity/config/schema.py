@@ -460,7 +460,7 @@ class ExportConfig:
 
 @dataclass
 class PlayConfig:
-    """Options of a film."""
+    """Options of a video."""
 
     run: Optional[str] = None
     """Run folder (its best checkpoint is played), checkpoint or ONNX file; null: env is played by policy."""
@@ -471,7 +471,9 @@ class PlayConfig:
     video: Optional[str] = None
     """File to write, NAME.mp4 or NAME.gif; null: a window on the display."""
     seconds: float = 20.0
-    """Length of the film, at the scene's own pace."""
+    """Length of the video, at the scene's own pace."""
+    caption: bool = True
+    """Write a line into the picture: scene, time, return of the episode so far (in soccer: goals)."""
     deterministic: bool = False
     """Take the most likely action instead of a sampled one."""
     seed: int = 0

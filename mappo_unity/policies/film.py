@@ -1,6 +1,6 @@
 """What mappo-play does: show a policy in its embedded scene, in a video file or in a window.
 
-In: `PlayConfig`. Out: a film, and what was played as a dict. Prints nothing, learns nothing.
+In: `PlayConfig`. Out: a video, and what was played as a dict. Prints nothing, learns nothing.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ import torch
 from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import Backend, ConfigError, PlayConfig
 from mappo_unity.envs.backends import make_env_function
+from mappo_unity.policies.camera import MovingCamera
+from mappo_unity.policies.caption import Tally
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.policies.policy import Policy
 from mappo_unity.policies.video import VideoFile, check_video
 from mappo_unity.policies.window import Window
 from mappo_unity.scenes.core.scene import Scene
-from mappo_unity.scenes.core.shapes import Camera, Drawing, Shape
+from mappo_unity.scenes.core.shapes import Camera, Drawing, Follow, Shape
 from mappo_unity.scenes.drawings import drawing_of
 from mappo_unity.termination import termination_as_interrupt
 
@@ -31,8 +33,8 @@ RANDOM = "random"
 class Screen(Protocol):
     """What shows frames: a video file or a window."""
 
-    def show(self, shapes: Sequence[Shape], camera: Camera) -> bool:
-        """Show a frame; return whether another one is wanted."""
+    def show(self, shapes: Sequence[Shape], camera: Camera, caption: Sequence[str] = ()) -> bool:
+        """Show a frame, with a line of text unless it is empty; return whether another one is wanted."""
         ...
 
 
@@ -44,11 +46,11 @@ def play(cfg: PlayConfig) -> dict[str, Any]:
 
     Raises:
         ConfigError: no scene of ours, no policy that fits it, no way to draw or to write the file.
-        Interrupted: SIGTERM came; like after Ctrl-C, nothing of the film is left.
+        Interrupted: SIGTERM came; like after Ctrl-C, nothing of the video is left.
     """
     video = Path(cfg.video) if cfg.video else None
     if video is not None:
-        check_video(video)
+        check_video(video, cfg.caption)
     torch.set_num_threads(1)
     torch.manual_seed(cfg.seed)
     scene = open_scene(cfg)
@@ -56,13 +58,13 @@ def play(cfg: PlayConfig) -> dict[str, Any]:
         policy = policy_of(cfg, scene)
         drawing = drawing_of(scene.NAME)
         pace = Pace(drawing, cfg.seconds)
-        first, size = _camera(drawing, scene), (cfg.width, cfg.height)
+        first, size = drawing.view(scene, 0), (cfg.width, cfg.height)
         if video is not None:
             with termination_as_interrupt(), VideoFile(video, first, size, pace.fps) as file:
-                figures = _roll(scene, policy, Projector(scene, drawing, pace, file))
+                figures = _roll(scene, policy, Projector(scene, drawing, pace, file, cfg.caption))
         else:
             with Window(first, size, pace.fps, f"mappo-play {scene.NAME}") as window:
-                figures = _roll(scene, policy, Projector(scene, drawing, pace, window))
+                figures = _roll(scene, policy, Projector(scene, drawing, pace, window, cfg.caption))
     finally:
         scene.close()
     return {"scene": scene.NAME, "policy": cfg.run or cfg.policy or RANDOM, "video": cfg.video} | figures
@@ -100,53 +102,45 @@ class Pace:
 
 
 class Projector:
-    """Show a scene on a screen, every few ticks, until the film is over."""
+    """Show a scene on a screen, every few ticks, until the video is over."""
 
-    def __init__(self, scene: Scene, drawing: Drawing, pace: Pace, screen: Screen) -> None:
+    def __init__(self, scene: Scene, drawing: Drawing, pace: Pace, screen: Screen, caption: bool) -> None:
         self.scene, self.drawing, self.pace, self.screen = scene, drawing, pace, screen
         self.ticks = self.frames = 0
         self.over = False
+        followed = int(scene.agents.agent_id[0]) if isinstance(drawing.camera, Follow) else None
+        self.tally = Tally(drawing.goals, followed)
+        self._camera = MovingCamera(scene, drawing, 1 / pace.fps)
+        self._caption = caption
 
     def tick(self) -> None:
         """Show the scene if a frame is due."""
         self.ticks += 1
         if self.over or self.ticks % self.pace.ticks:
             return
-        shapes, camera = self.drawing.shapes(self.scene, 0), _camera(self.drawing, self.scene)
-        wanted = self.screen.show(shapes, camera)
+        time = f"{self.ticks * self.drawing.tick_s:.1f} s"
+        caption = [self.scene.NAME, time, *self.tally.score()] if self._caption else []
+        wanted = self.screen.show(self.drawing.shapes(self.scene, 0), self._camera.view(), caption)
         self.frames += 1
         self.over = not wanted or self.frames >= self.pace.frames
 
 
 def _roll(scene: Scene, policy: Policy, projector: Projector) -> dict[str, Any]:
-    """Play until the film is over."""
+    """Play until the video is over."""
     scene.after_tick = projector.tick
-    returns: list[float] = []
-    running: dict[tuple[str, int], float] = {}
     scene.reset()
     while not projector.over:
-        for name, spec in scene.behavior_specs.items():
-            decisions, terminals = scene.get_steps(name)
-            rewards = (terminals.reward + terminals.group_reward).tolist()
-            for agent, reward in zip(terminals.agent_id.tolist(), rewards):
-                if (name, agent) in running:
-                    returns.append(running.pop((name, agent)) + reward)
-            agents = decisions.agent_id.tolist()
-            policy.forget(name, [agent for agent in agents if (name, agent) not in running])
-            rewards = (decisions.reward + decisions.group_reward).tolist()
-            for agent, reward in zip(agents, rewards):
-                running[name, agent] = running.get((name, agent), 0.0) + reward
-            if agents:
+        steps = {name: scene.get_steps(name) for name in scene.behavior_specs}
+        for name, begun in projector.tally.add(steps).items():
+            policy.forget(name, begun)
+            decisions, spec = steps[name][0], scene.behavior_specs[name]
+            if len(decisions):
                 scene.set_actions(name, policy.act(name, decisions, spec))
         scene.step()
-    mean = sum(returns) / len(returns) if returns else None
+    returns = projector.tally.returns
     return {
         "seconds": projector.frames / projector.pace.fps,
         "frames": projector.frames,
         "episodes": len(returns),
-        "mean_return": mean,
+        "mean_return": sum(returns) / len(returns) if returns else None,
     }
-
-
-def _camera(drawing: Drawing, scene: Scene) -> Camera:
-    return drawing.camera(scene, 0) if callable(drawing.camera) else drawing.camera

@@ -1,4 +1,4 @@
-"""Films: frames into .mp4 (H.264) and .gif files.
+"""Videos: frames into .mp4 (H.264) and .gif files.
 
 In: shapes or frames. Out: a file, which appears under its name only when it is complete. Knows no scene.
 """
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.config.schema import ConfigError
+from mappo_unity.policies.caption import draw_caption
 from mappo_unity.policies.render import Renderer
 from mappo_unity.scenes.core.shapes import Camera, Shape
 
@@ -29,7 +30,7 @@ class VideoFile:
     """Draw shapes into a video file; a context manager, which discards the file after an error.
 
     Args:
-        path: NAME.mp4 or NAME.gif; overwritten when the film is complete.
+        path: NAME.mp4 or NAME.gif; overwritten when the video is complete.
         camera: the first view.
         size: width and height in pixels, both even.
         fps: frames a second.
@@ -42,13 +43,16 @@ class VideoFile:
     def __init__(self, path: Path, camera: Camera, size: tuple[int, int], fps: float) -> None:
         check_video(path)
         self._path, self._size, self._fps = path, size, fps
-        # Hidden, and no suffix of a film's: nobody may take it for one.
+        # Hidden, and no suffix of a video's: nobody may take it for one.
         self._part = path.with_name(f".{path.stem[:40]}.{os.getpid()}.part")
         self._renderer = Renderer(camera, *size)
 
-    def show(self, shapes: Sequence[Shape], camera: Camera) -> bool:
-        """Append a frame; return True: a file always wants more."""
-        self.write(self._renderer.frame(shapes, camera))
+    def show(self, shapes: Sequence[Shape], camera: Camera, caption: Sequence[str] = ()) -> bool:
+        """Append a frame, with a line of text if there are parts of one; return True: a file wants more."""
+        frame = self._renderer.frame(shapes, camera)
+        if caption:
+            draw_caption(frame, caption)
+        self.write(frame)
         return True
 
     def write(self, frame: np.ndarray) -> None:
@@ -78,7 +82,7 @@ class VideoFile:
 
 
 class GifWriter:
-    """Collect frames; write them when the film is over, with a time for each.
+    """Collect frames; write them when the video is over, with a time for each.
 
     A GIF counts in hundredths of a second: frames end at their time rounded to it, so errors do not add up.
     """
@@ -107,14 +111,14 @@ class GifWriter:
 class Mp4Writer:
     """Send frames to ffmpeg.
 
-    Not imageio-ffmpeg's own writer: it passes over ffmpeg's exit code, and a full disk gives a broken film.
+    Not imageio-ffmpeg's own writer: it passes over ffmpeg's exit code, and a full disk gives a broken video.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:
         program = importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
         rate = Fraction(fps).limit_denominator(1001)
         source = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {rate} -i -"
-        target = "-an -c:v libx264 -pix_fmt yuv420p -crf 15 -f mp4"
+        target = "-an -c:v libx264 -preset veryfast -pix_fmt yuv420p -crf 15 -f mp4"
         self._process = subprocess.Popen(
             [program, "-y", "-v", "error", "-xerror", *source.split(), *target.split(), str(path.absolute())],
             stdin=subprocess.PIPE,
@@ -129,7 +133,7 @@ class Mp4Writer:
             self._process.stdin.write(frame.tobytes())
         except BrokenPipeError:
             self.finish()
-            raise OSError("ffmpeg ended before the film was complete") from None
+            raise OSError("ffmpeg ended before the video was complete") from None
 
     def finish(self) -> None:
         """Wait until the file is written; raises OSError with ffmpeg's first complaint."""
@@ -145,8 +149,8 @@ class Mp4Writer:
         self._process.communicate()
 
 
-def check_video(path: Path) -> None:
-    """Raise ConfigError if no video can be written to `path`."""
+def check_video(path: Path, caption: bool = False) -> None:
+    """Raise ConfigError if no video, with a caption where that is wanted, can be written to `path`."""
     if path.suffix not in SUFFIXES:
         raise ConfigError(f"video={path} must end in one of: {', '.join(SUFFIXES)}")
     with _told(path):
@@ -155,18 +159,23 @@ def check_video(path: Path) -> None:
         raise ConfigError(
             f"video={path} cannot be written: {path.parent} must be a folder that can be written"
         )
-    package = "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL"
+    _check_package(f"video={path}", "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL")
+    if caption:
+        _check_package("caption=true", "PIL")
+
+
+def _check_package(option: str, package: str) -> None:
     try:
         importlib.import_module(package)
     except ImportError as error:
         raise ConfigError(
-            f"video={path} needs the package {package}: pip install 'mappo-unity[video]'"
+            f"{option} needs the package {package}: pip install 'mappo-unity[video]'"
         ) from error
 
 
 @contextmanager
 def _told(path: Path) -> Iterator[None]:
-    """Tell what kept a film from being written as a mistake in the options."""
+    """Tell what kept a video from being written as a mistake in the options."""
     try:
         yield
     except OSError as error:

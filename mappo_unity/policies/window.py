@@ -34,7 +34,7 @@ class Window:
 
     def __init__(self, camera: Camera, size: tuple[int, int], fps: float, title: str) -> None:
         if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise ConfigError("there is no display for a window here; video=FILE.mp4 or .gif writes a film")
+            raise ConfigError("there is no display for a window here; video=FILE.mp4 or .gif writes a video")
         import glfw
 
         glfw.ERROR_REPORTING = "ignore"  # no warnings beside our message
@@ -45,7 +45,7 @@ class Window:
             self._window = glfw.create_window(*size, title, None, None)
         if not self._window:
             glfw.terminate()
-            raise ConfigError("no window can be opened on the display; video=FILE.mp4 or .gif writes a film")
+            raise ConfigError("no window can be opened on the display; video=FILE.mp4 or .gif writes a video")
         glfw.make_context_current(self._window)
         self._stage = Stage(camera, *size)
         self._context = mujoco.MjrContext(self._stage.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -53,10 +53,13 @@ class Window:
         self._frame_s = 1.0 / fps
         self._due = time.monotonic()
 
-    def show(self, shapes: Sequence[Shape], camera: Camera) -> bool:
-        """Show a frame when its time has come; return False once the window was closed."""
-        size = self._glfw.get_framebuffer_size(self._window)
-        mujoco.mjr_render(mujoco.MjrRect(0, 0, *size), self._stage.fill(shapes, camera), self._context)
+    def show(self, shapes: Sequence[Shape], camera: Camera, caption: Sequence[str] = ()) -> bool:
+        """Show a frame, over it a line of text, when its time has come; return False once it was closed."""
+        area = mujoco.MjrRect(0, 0, *self._glfw.get_framebuffer_size(self._window))
+        mujoco.mjr_render(area, self._stage.fill(shapes, camera), self._context)
+        if caption:
+            font, corner = mujoco.mjtFont.mjFONT_NORMAL.value, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT.value
+            mujoco.mjr_overlay(font, corner, area, "    ".join(caption), "", self._context)
         self._due = max(self._due + self._frame_s, time.monotonic() - self._frame_s)
         time.sleep(max(0.0, self._due - time.monotonic()))
         self._glfw.swap_buffers(self._window)

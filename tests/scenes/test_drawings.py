@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,16 @@ from mappo_unity.config.schema import ConfigError
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.scenes import make_scene, scene_names
 from mappo_unity.scenes.core.shapes import (
+    BLUE,
     GREEN,
     ORANGE,
+    PURPLE,
+    Camera,
+    Follow,
     Kind,
     Shape,
     along,
+    box,
     quaternion_rotation,
     yaw_rotation,
 )
@@ -51,16 +57,51 @@ def test_every_scene_has_a_drawing_of_sound_shapes_in_its_view(name: str) -> Non
         shapes = drawing.shapes(scene, area)
         for shape in shapes:
             check_shape(shape)
-        camera = drawing.camera(scene, area) if callable(drawing.camera) else drawing.camera
-        yaw, pitch = np.radians([camera.yaw, camera.pitch])
-        view = np.array([np.sin(yaw) * np.cos(pitch), -np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
-        offset = np.array([shape.position for shape in shapes]) - camera.target
-        depth = offset @ view + camera.distance
-        aside = np.linalg.norm(offset - np.outer(offset @ view, view), axis=1)
-        half = np.tan(np.radians(camera.field_of_view / 2)) * 2.05  # to the corner of a picture of 16 : 9
-        shares = (depth > 0) & (aside < half * depth)
-        assert shares.mean() > (0.5 if name == "Walker" else 0.95)  # the walker's view goes with it
+        across, down, _ = in_picture(shapes, drawing.view(scene, area))
+        seen = (np.abs(across) < 1) & (np.abs(down) < 1)
+        if not isinstance(drawing.camera, Follow):
+            assert seen.mean() > 0.95
     assert drawing.tick_s > 0
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_agents_are_large_enough_to_be_seen(name: str) -> None:
+    scene, drawing = played(name), drawing_of(name)
+    agents = [
+        shape
+        for shape in drawing.shapes(scene, 1)
+        if shape.color in (BLUE, PURPLE, FROZEN_COLOR) and (len(set(shape.size)) == 1 or name == "Walker")
+    ]
+    if isinstance(drawing.camera, Follow) and name != "Walker":
+        agents = agents[:1]  # the others come and go
+    across, down, pixels = in_picture(agents, drawing.view(scene, 1))
+    assert (np.abs(across) < 0.95).all()
+    assert (-0.95 < down).all() and (down < 0.87).all()  # above the caption
+    height = np.ptp(down) * 544 / 2 if name == "Walker" else pixels * 2 * agents[0].size[1]
+    assert np.min(height) > 17
+
+
+@pytest.mark.parametrize(
+    ("name", "x", "z"), [("GridFoodCollector", 49, 49), ("Pyramids", 49, 49), ("Hallway", 9, 24)]
+)
+def test_an_agent_in_a_corner_is_in_the_picture(name: str, x: float, z: float) -> None:
+    camera = drawing_of(name).camera
+    assert isinstance(camera, Follow)
+    for corner in ((-x, 0.5, -z), (x, 0.5, -z), (-x, 0.5, z), (x, 0.5, z)):
+        follow = replace(camera, place=lambda scene, area, at=corner: at)
+        across, down, _ = in_picture([box(corner, (0.5, 0.5, 0.5), BLUE)], follow.view(None, 0))
+        assert abs(across[0]) < 0.97 and -0.97 < down[0] < 0.87
+
+
+def in_picture(shapes: list[Shape], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where shapes are in a picture of 960x544, -1 to 1 across and down, and pixels a metre."""
+    yaw, pitch = np.radians([camera.yaw, camera.pitch])
+    ahead = np.array([np.sin(yaw) * np.cos(pitch), -np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    right = np.array([np.cos(yaw), 0, -np.sin(yaw)])
+    below = np.array([-np.sin(yaw) * np.sin(pitch), -np.cos(pitch), -np.cos(yaw) * np.sin(pitch)])
+    offset = np.array([shape.position for shape in shapes]) - camera.target
+    half = (offset @ ahead + camera.distance) * np.tan(np.radians(camera.field_of_view / 2))
+    return offset @ right / half * 544 / 960, offset @ below / half, 544 / 2 / half
 
 
 def test_shapes_follow_the_bodies() -> None:

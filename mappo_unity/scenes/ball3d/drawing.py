@@ -32,4 +32,4 @@ def shapes(scene: Ball3D, area: int) -> list[Shape]:
     return drawn
 
 
-DRAWING = Drawing(shapes, Camera((0.0, 0.9, 0.0), 17.5, yaw=22.0, pitch=20.0))
+DRAWING = Drawing(shapes, Camera((0.0, 0.5, 0.0), 16.5, yaw=22.0, pitch=20.0))

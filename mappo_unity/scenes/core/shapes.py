@@ -6,8 +6,9 @@ x right, y up, z forward, metres; left-handed, so a positive yaw turns clockwise
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -42,6 +43,8 @@ class Shape:
     rotation: np.ndarray
     """[3, 3]: its columns are the shape's own x, y, z axes."""
     color: Color
+    shadow: bool = True
+    """Whether it throws one: not what can be seen through, and floors and small parts need none."""
 
 
 @dataclass(frozen=True)
@@ -61,21 +64,47 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class Follow:
+    """Go with the first agent of an area that is too large to be seen as a whole."""
+
+    camera: Camera
+    """The view; its target counts from the place of the agent."""
+    place: Callable[[Any, int], Sequence[float] | np.ndarray]
+    """Called as place(scene, area): where the agent is, [3], m."""
+    reach: tuple[float, float] = (math.inf, math.inf)
+    """The point looked at stays that close to the area's middle in x and z, m: outside is nothing to see."""
+
+    def view(self, scene: Any, area: int) -> Camera:
+        """Return the view of the agent where it is now."""
+        target = np.add(self.place(scene, area), self.camera.target)
+        target[[0, 2]] = np.clip(target[[0, 2]], np.negative(self.reach), self.reach)
+        return replace(self.camera, target=tuple(target.tolist()))
+
+
+@dataclass(frozen=True)
 class Drawing:
     """How a scene is shown."""
 
     shapes: Callable[[Any, int], list[Shape]]
     """Called as shapes(scene, area): everything to be seen in that area now."""
-    camera: Camera | Callable[[Any, int], Camera]
-    """A fixed view, or camera(scene, area): one that follows."""
+    camera: Camera | Follow
+    """A fixed view, or one that follows."""
     tick_s: float = 0.02
-    """Seconds of film that a tick takes."""
+    """Seconds of video that a tick takes."""
+    goals: bool = False
+    """Whether blue (team 0) and purple (team 1) play for goals."""
+
+    def view(self, scene: Any, area: int) -> Camera:
+        """Return where the camera belongs now."""
+        return self.camera.view(scene, area) if isinstance(self.camera, Follow) else self.camera
 
 
 GREY: Color = (0.62, 0.64, 0.67, 1.0)
 DARK: Color = (0.16, 0.17, 0.20, 1.0)
 WHITE: Color = (0.95, 0.95, 0.95, 1.0)
 FLOOR: Color = (0.80, 0.82, 0.85, 1.0)
+LINE: Color = (0.72, 0.74, 0.78, 1.0)
+"""Lines on the floor."""
 WALL: Color = (0.47, 0.53, 0.62, 1.0)
 BLUE: Color = (0.20, 0.45, 0.85, 1.0)
 PURPLE: Color = (0.52, 0.30, 0.78, 1.0)
@@ -91,16 +120,21 @@ def box(
     half: Sequence[float] | np.ndarray,
     color: Color,
     rotation: np.ndarray | None = None,
+    shadow: bool = True,
 ) -> Shape:
     """Return a box; `half`: half-edges along its own axes."""
-    return _shape(Kind.box, half, middle, rotation, color)
+    return _shape(Kind.box, half, middle, rotation, color, shadow)
 
 
 def ball(
-    middle: Sequence[float] | np.ndarray, radius: float, color: Color, rotation: np.ndarray | None = None
+    middle: Sequence[float] | np.ndarray,
+    radius: float,
+    color: Color,
+    rotation: np.ndarray | None = None,
+    shadow: bool = True,
 ) -> Shape:
     """Return a sphere."""
-    return _shape(Kind.ellipsoid, (radius, radius, radius), middle, rotation, color)
+    return _shape(Kind.ellipsoid, (radius, radius, radius), middle, rotation, color, shadow)
 
 
 def cylinder(
@@ -146,6 +180,15 @@ def square_walls(
     ]
 
 
+def floor_lines(half: float, spacing: float, width: float, color: Color, top: float = 0.0) -> list[Shape]:
+    """Return lines on a square floor of half-width `half` m: they show how fast what is followed moves."""
+    ends = half - half % spacing
+    lines = np.arange(-ends, ends + spacing / 2, spacing)
+    along_z = [box((x, top, 0), (width / 2, 0.004, half), color, shadow=False) for x in lines]
+    along_x = [box((0, top, z), (half, 0.004, width / 2), color, shadow=False) for z in lines]
+    return along_z + along_x
+
+
 def agent_cube(
     middle: Sequence[float] | np.ndarray, half: float, yaw: float, color: Color, headband: bool = False
 ) -> list[Shape]:
@@ -155,10 +198,11 @@ def agent_cube(
     for side in (-1, 1):
         eye = middle + turn @ (half * np.array([0.42 * side, 0.35, 0.98]))
         pupil = middle + turn @ (half * np.array([0.42 * side, 0.35, 1.10]))
-        shapes += [ball(eye, 0.26 * half, WHITE), ball(pupil, 0.16 * half, DARK)]
+        shapes += [ball(eye, 0.26 * half, WHITE, shadow=False)]
+        shapes += [ball(pupil, 0.16 * half, DARK, shadow=False)]
     if headband:
         band = middle + turn @ (half * np.array([0.0, 0.78, 0.0]))
-        shapes.append(box(band, (1.03 * half, 0.12 * half, 1.03 * half), WHITE, turn))
+        shapes.append(box(band, (1.03 * half, 0.12 * half, 1.03 * half), WHITE, turn, shadow=False))
     return shapes
 
 
@@ -200,6 +244,8 @@ def _shape(
     middle: Sequence[float] | np.ndarray,
     rotation: np.ndarray | None,
     color: Color,
+    shadow: bool = True,
 ) -> Shape:
     turn = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    return Shape(kind, tuple(float(part) for part in size), np.asarray(middle, float), turn, color)
+    sizes, shadow = tuple(float(part) for part in size), shadow and color[3] == 1
+    return Shape(kind, sizes, np.asarray(middle, float), turn, color, shadow)

@@ -82,7 +82,7 @@ def shapes(scene: DungeonEscape, area: int) -> list[Shape]:
 
 
 def _room() -> list[Shape]:
-    drawn = [box((0, -0.1, 0), (WALL_FACE, 0.1, WALL_FACE), FLOOR)]
+    drawn = [box((0, -0.1, 0), (WALL_FACE, 0.1, WALL_FACE), FLOOR, shadow=False)]
     drawn += square_walls(WALL_FACE, WALL_FACE, WALL_SHOWN, 0.5, WALL)
     for x in (-COLUMN[0], COLUMN[0]):
         for z in (-COLUMN[1], COLUMN[1]):
@@ -108,4 +108,4 @@ def _key(place: np.ndarray, yaw: float) -> list[Shape]:
     ]
 
 
-DRAWING = Drawing(shapes, Camera((0.6, 0.0, -0.8), 43.0, yaw=10.0, pitch=48.0))
+DRAWING = Drawing(shapes, Camera((0.4, 0.0, -2.0), 41.5, yaw=0.0, pitch=56.0))

@@ -8,16 +8,19 @@ from mappo_unity.scenes.core.shapes import (
     BLUE,
     FLOOR,
     GREEN,
+    LINE,
     RED,
     WALL,
     Camera,
     Color,
     Drawing,
+    Follow,
     Shape,
     agent_cube,
     ball,
     box,
     cylinder,
+    floor_lines,
     square_walls,
     yaw_rotation,
 )
@@ -28,22 +31,21 @@ from mappo_unity.scenes.grid_food_collector.scene import AGENTS, GOOD, WALL_HEIG
 
 FROZEN_COLOR: Color = (0.55, 0.88, 0.98, 1.0)
 LASER: Color = (1.0, 0.35, 0.25, 0.45)
-AGENT_SHOWN = 2.0  # times as large as they are: an agent is a hundredth of the arena
 
 
 def shapes(scene: GridFoodCollector, area: int) -> list[Shape]:
-    """Return floor, walls, food (good: green, bad: red), agents (frozen: pale) and their lasers."""
+    """Return the arena, food (good: green), agents (frozen: pale; the one followed: headband), lasers."""
     physics = scene.physics
-    drawn = [box((0, -0.1, 0), (WALL_FACE, 0.1, WALL_FACE), FLOOR)]
+    drawn = [box((0, -0.1, 0), (WALL_FACE, 0.1, WALL_FACE), FLOOR, shadow=False)]
+    drawn += floor_lines(WALL_FACE, 10.0, 0.12, LINE)
     drawn += square_walls(WALL_FACE, WALL_FACE, WALL_HEIGHT, 1.0, WALL)
     for number, place in enumerate(physics.ball_position[:, area].T):
         drawn.append(ball(place, BALL_RADIUS, GREEN if number < GOOD else RED))
     for agent in range(AGENTS):
         yaw = float(physics.agent_yaw[area, agent])
         color = FROZEN_COLOR if scene.frozen[area, agent] else BLUE
-        half = AGENT_SHOWN * float(physics.agent_half[area, agent])
-        place = physics.agent_position[:, area, agent] + [0, half - half / AGENT_SHOWN, 0]
-        drawn += agent_cube(place, half, yaw, color)
+        place, half = physics.agent_position[:, area, agent], float(physics.agent_half[area, agent])
+        drawn += agent_cube(place, half, yaw, color, headband=agent == 0)
         if scene.laser_on[area, agent]:
             drawn.append(_laser(place, yaw))
     return drawn
@@ -56,4 +58,10 @@ def _laser(place: np.ndarray, yaw: float) -> Shape:
     return cylinder(place + turn @ np.array([0, 0, half]), 0.35, half, LASER, lying)
 
 
-DRAWING = Drawing(shapes, Camera((0.0, 0.0, -5.0), 150.0, yaw=0.0, pitch=55.0))
+def followed(scene: GridFoodCollector, area: int) -> np.ndarray:
+    """Return where the first agent is, on the floor."""
+    return scene.physics.agent_position[:, area, 0] * [1, 0, 1]
+
+
+VIEW = Camera((0.0, 0.0, 0.0), 40.0, yaw=0.0, pitch=52.0)
+DRAWING = Drawing(shapes, Follow(VIEW, followed, reach=(34.0, 39.0)))

@@ -16,6 +16,7 @@ from mappo_unity.scenes.core.shapes import (
     Camera,
     Color,
     Drawing,
+    Follow,
     Shape,
     agent_cube,
     along,
@@ -42,12 +43,12 @@ WALL_SHOWN = 1.0  # m: cut off, to look inside
 
 def shapes(scene: Hallway, area: int) -> list[Shape]:
     """Return the hall, the symbol block (X: red, O: orange), the goals with their symbols and the agent."""
-    drawn = [box((0, FLOOR_Y - 0.1, 0), (ROOM_HALF[0], 0.1, ROOM_HALF[1]), FLOOR)]
+    drawn = [box((0, FLOOR_Y - 0.1, 0), (ROOM_HALF[0], 0.1, ROOM_HALF[1]), FLOOR, shadow=False)]
     drawn += square_walls(*ROOM_HALF, WALL_SHOWN, 0.5, WALL, (0, FLOOR_Y, 0))
     drawn += _sign(scene.symbol[area], SYMBOL_HALF, GREY, bool(scene.shows_x[area]))
     for side in (1, -1):
         x = side * GOAL_X
-        drawn.append(box((x, *PLATE_CENTRE), PLATE_HALF, GREEN))
+        drawn.append(box((x, *PLATE_CENTRE), PLATE_HALF, GREEN, shadow=False))
         drawn += _sign(np.array([x, *PANEL_CENTRE]), PANEL_HALF, GREY, bool(scene.o_side[area] != side))
     yaw = float(scene.yaw[area])
     return drawn + agent_cube(scene.position[area], AGENT_HALF[0], yaw, BLUE)
@@ -69,4 +70,10 @@ def _sign(middle: np.ndarray, half: tuple[float, float, float], color: Color, sh
     return drawn
 
 
-DRAWING = Drawing(shapes, Camera((0.0, 0.0, 0.0), 58.0, yaw=-58.0, pitch=38.0))
+def followed(scene: Hallway, area: int) -> np.ndarray:
+    """Return how far down the hall the agent is."""
+    return scene.position[area] * [0, 0, 1]
+
+
+VIEW = Camera((0.0, 0.0, 6.0), 36.0, yaw=-62.0, pitch=38.0)
+DRAWING = Drawing(shapes, Follow(VIEW, followed, reach=(0.0, 17.0)))

@@ -9,15 +9,18 @@ from mappo_unity.scenes.core.shapes import (
     FLOOR,
     GREEN,
     GREY,
+    LINE,
     ORANGE,
     RED,
     WALL,
     YELLOW,
     Camera,
     Drawing,
+    Follow,
     Shape,
     agent_cube,
     box,
+    floor_lines,
     quaternion_rotation,
     yaw_rotation,
 )
@@ -26,15 +29,19 @@ from mappo_unity.scenes.pyramids.bricks import ABSENT, HALVES
 from mappo_unity.scenes.pyramids.layout import INNER_WALLS, LAYERS, OUTER_WALLS, STONES
 from mappo_unity.scenes.pyramids.scene import Pyramids
 
-AGENT_SHOWN = 2.0  # times as large as it is: an agent is a hundredth of the arena
+WALL_SHOWN = 2.0  # m: the real ones are 4.5 m high and would hide the agent
 
 
 def shapes(scene: Pyramids, area: int) -> list[Shape]:
     """Return arena, stones, the switch (red: off, green: on), bricks with the goal on top, and the agent."""
     bodies, bricks = scene.bodies, scene.bricks
-    drawn = [box((0, -0.1, 0), (50.0, 0.1, 50.0), FLOOR)]
-    drawn += [_standing(wall, 1.5) for wall in OUTER_WALLS]
-    drawn += [_standing(wall, 4.52) for wall in INNER_WALLS]
+    drawn = [box((0, -0.1, 0), (50.0, 0.1, 50.0), FLOOR, shadow=False)]
+    drawn += floor_lines(50.0, 10.0, 0.12, LINE)
+    drawn += [_standing(wall, WALL_SHOWN) for wall in OUTER_WALLS]
+    for number, wall in enumerate(INNER_WALLS):
+        drawn.append(
+            _standing(wall, WALL_SHOWN + 0.02 * (number % 2))
+        )  # no surface in common where they cross
     heights = bodies.stone_heights(np.array([area]))[0]
     for x, z in bodies.stone_root[area]:
         for layer, height in zip(LAYERS, heights, strict=True):
@@ -48,9 +55,7 @@ def shapes(scene: Pyramids, area: int) -> list[Shape]:
         for number, pose in enumerate(bricks.bodies[area]):
             color = YELLOW if number == len(HALVES) - 1 else ORANGE
             drawn.append(box(pose[:3], HALVES[number], color, quaternion_rotation(pose[3:])))
-    half = AGENT_SHOWN * AGENT_HALF[0]
-    place = bodies.position[area] + [0, half - AGENT_HALF[1], 0]
-    return drawn + agent_cube(place, half, float(bodies.yaw[area]), BLUE)
+    return drawn + agent_cube(bodies.position[area], AGENT_HALF[0], float(bodies.yaw[area]), BLUE)
 
 
 def _standing(wall: np.ndarray, top: float) -> Shape:
@@ -58,4 +63,10 @@ def _standing(wall: np.ndarray, top: float) -> Shape:
     return box((wall[0], top / 2, wall[2]), (wall[3], top / 2, wall[5]), WALL)
 
 
-DRAWING = Drawing(shapes, Camera((0.0, 0.0, -4.0), 148.0, yaw=0.0, pitch=52.0))
+def followed(scene: Pyramids, area: int) -> np.ndarray:
+    """Return where the agent is, on the floor."""
+    return scene.bodies.position[area] * [1, 0, 1]
+
+
+VIEW = Camera((0.0, 0.0, 0.0), 38.0, yaw=0.0, pitch=54.0)
+DRAWING = Drawing(shapes, Follow(VIEW, followed, reach=(35.0, 40.0)))

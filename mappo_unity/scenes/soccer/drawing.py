@@ -54,13 +54,13 @@ def shapes(scene: SoccerScene, area: int) -> list[Shape]:
 
 def _pitch(blue_closed: bool) -> list[Shape]:
     drawn = [
-        box((0, -0.1, 0), (CORNER_X[0], 0.1, SIDE_Z), GRASS),
-        box((0, -0.101, 0), (HALF_LENGTH, 0.1, CORNER_Z[1]), GRASS),
-        box((0, 0.0, 0), (0.06, 0.01, SIDE_Z), WHITE),
+        box((0, -0.1, 0), (CORNER_X[0], 0.1, SIDE_Z), GRASS, shadow=False),
+        box((0, -0.101, 0), (HALF_LENGTH, 0.1, CORNER_Z[1]), GRASS, shadow=False),
+        box((0, 0.0, 0), (0.06, 0.01, SIDE_Z), WHITE, shadow=False),
     ]
     for angle in np.linspace(0, 2 * np.pi, 36, endpoint=False):
         place = (CIRCLE_RADIUS * np.sin(angle), 0.0, CIRCLE_RADIUS * np.cos(angle))
-        drawn.append(box(place, (0.22, 0.01, 0.05), WHITE, yaw_rotation(float(angle))))
+        drawn.append(box(place, (0.22, 0.01, 0.05), WHITE, yaw_rotation(float(angle)), shadow=False))
     half = WALL_SHOWN / 2
     length = math.hypot(CORNER_X[1] - CORNER_X[0], CORNER_Z[1] - CORNER_Z[0])
     normal = np.array([0.5 * math.sqrt(3), 0.5])  # of the corner at x, z > 0, off the pitch
@@ -73,7 +73,7 @@ def _pitch(blue_closed: bool) -> list[Shape]:
             place = (end * wall[0], half, side * wall[1])
             drawn.append(box(place, (length / 2, half, 0.23), WALL, turn))
             place = (end * grass[0], -0.102, side * grass[1])
-            drawn.append(box(place, (length / 2, 0.1, 0.8), GRASS, turn))
+            drawn.append(box(place, (length / 2, 0.1, 0.8), GRASS, turn, shadow=False))
     if blue_closed:
         drawn.append(box((-BLOCK_X - 0.25, half, 0), (0.25, half, BLOCK_Z), WALL))
     for end, color in ((-1, BLUE), (1, PURPLE)):
@@ -84,11 +84,14 @@ def _pitch(blue_closed: bool) -> list[Shape]:
 def _net(end: int, front: float, color: Color) -> list[Shape]:
     middle, height = end * (front + NET_LENGTH / 2), NET_SHOWN / 2
     glass = faded(color, 0.45)
-    drawn = [box((middle, -0.1, 0), (NET_LENGTH / 2, 0.1, NET_Z + 0.1), color)]
+    drawn = [box((middle, -0.1, 0), (NET_LENGTH / 2, 0.1, NET_Z + 0.1), color, shadow=False)]
     for side in (1, -1):
         drawn.append(box((middle, height, side * (NET_Z + 0.05)), (NET_LENGTH / 2, height, 0.05), glass))
     back = end * (front + NET_LENGTH - 0.05)
     return [*drawn, box((back, height, 0), (0.05, height, NET_Z), glass)]
 
 
-DRAWING = Drawing(shapes, Camera((0.0, 0.0, -0.8), 38.0, yaw=0.0, pitch=48.0))
+VIEW = Camera(
+    (0.02, 0.0, -1.0), 36.0, yaw=0.0, pitch=54.0
+)  # half a pixel aside: the halfway line tapers evenly
+DRAWING = Drawing(shapes, VIEW, goals=True)

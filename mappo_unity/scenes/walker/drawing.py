@@ -15,6 +15,7 @@ from mappo_unity.scenes.core.shapes import (
     YELLOW,
     Camera,
     Drawing,
+    Follow,
     Shape,
     along,
     ball,
@@ -22,6 +23,7 @@ from mappo_unity.scenes.core.shapes import (
     capsule,
     cylinder,
     faded,
+    floor_lines,
     quaternion_rotation,
     square_walls,
 )
@@ -43,17 +45,20 @@ def shapes(scene: Walker, area: int) -> list[Shape]:
         drawn.append(_part(number, part, place, turn))
         if part.name == "head":
             for side in (-1, 1):
-                drawn.append(ball(place + turn @ np.array([0.08 * side, 0.05, 0.19]), 0.055, WHITE))
-                drawn.append(ball(place + turn @ np.array([0.08 * side, 0.05, 0.23]), 0.03, DARK))
+                drawn.append(
+                    ball(place + turn @ np.array([0.08 * side, 0.05, 0.19]), 0.055, WHITE, shadow=False)
+                )
+                drawn.append(
+                    ball(place + turn @ np.array([0.08 * side, 0.05, 0.23]), 0.03, DARK, shadow=False)
+                )
     target = scene.physics.target_position[area]
     drawn.append(box(target, (body.TARGET_HALF,) * 3, YELLOW))
     return [*drawn, cylinder(target + [0, 1.0, 0], 0.03, 1.0, faded(YELLOW, 0.6))]
 
 
-def camera(scene: Walker, area: int) -> Camera:
-    """Return a view that goes with the hips."""
-    x, _, z = scene.physics.position[area, 0].tolist()
-    return Camera((x, 0.8, z), 7.0, yaw=145.0, pitch=14.0)
+def followed(scene: Walker, area: int) -> np.ndarray:
+    """Return where the hips are, on the ground."""
+    return scene.physics.position[area, 0] * [1, 0, 1]
 
 
 def _part(number: int, part: body.Part, place: np.ndarray, turn: np.ndarray) -> Shape:
@@ -70,11 +75,10 @@ def _part(number: int, part: body.Part, place: np.ndarray, turn: np.ndarray) -> 
 
 def _platform() -> list[Shape]:
     top = body.GROUND_Y
-    drawn = [box((0, top - 0.1, 0), (PLATFORM_HALF, 0.1, PLATFORM_HALF), FLOOR)]
-    for line in np.arange(-10, 10.1, 2.5):
-        drawn.append(box((line, top, 0), (0.02, 0.004, PLATFORM_HALF), GREY))
-        drawn.append(box((0, top, line), (PLATFORM_HALF, 0.004, 0.02), GREY))
+    drawn = [box((0, top - 0.1, 0), (PLATFORM_HALF, 0.1, PLATFORM_HALF), FLOOR, shadow=False)]
+    drawn += floor_lines(PLATFORM_HALF, 2.5, 0.04, GREY, top)
     return drawn + square_walls(PLATFORM_HALF, PLATFORM_HALF, 0.5, 0.25, WALL, (0, top, 0))
 
 
-DRAWING = Drawing(shapes, camera, tick_s=body.TICK_S)
+VIEW = Camera((0.0, 0.8, 0.0), 7.0, yaw=145.0, pitch=14.0)
+DRAWING = Drawing(shapes, Follow(VIEW, followed), tick_s=body.TICK_S)
