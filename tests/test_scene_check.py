@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
+from mappo_unity.envs.contract import ContractError
 from mappo_unity.scenes.ball3d.scene import Ball3D
-from mappo_unity.scenes.core.contract import ContractError, check_env, main, random_actions
+from mappo_unity.scenes.core.checked_play import random_actions
+from mappo_unity.scenes.core.contract import check_env, main
+from mappo_unity.scenes.core.lifecycle import Lives
 
 NAME = "3DBall?team=0"
 Steps = tuple[DecisionSteps, TerminalSteps]
@@ -84,7 +87,10 @@ def other_group(steps: Steps) -> Steps:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (spoil_decisions(not_finite), r"3DBall\?team=0, agent 1: sensor VectorSensor_size8 is not finite"),
+        (
+            spoil_decisions(not_finite),
+            r"3DBall\?team=0', agent 1: its sensor obs_0 \(VectorSensor_size8\) holds nan",
+        ),
         (spoil_decisions(wrong_dtype), "DecisionSteps reward dtype float64, not float32"),
         (spoil_decisions(repeated_id), "agent 2: twice in one DecisionSteps"),
         (spoil_decisions(wrong_shape), r"shape \(3, 7\), not \(3, 8\)"),
@@ -125,6 +131,22 @@ def test_an_ignored_seed_is_found() -> None:
         check_env(Ball3D(num_areas=2), steps=40, remake=lambda: Ball3D(num_areas=2, seed=next(seeds)))
 
 
+def test_an_agent_of_two_behaviors_is_found() -> None:
+    lives = Lives()
+    spec = Ball3D.BEHAVIORS[0].spec()
+    steps = DecisionSteps.empty(spec)
+    steps.agent_id, steps.group_id = np.array([3]), np.array([0])
+    lives.begin_result()
+    lives.ask("Big", steps)
+    with pytest.raises(
+        ContractError, match="Small, agent 3: asks under two behaviors at once, here and in Big"
+    ):
+        lives.ask("Small", steps)
+    lives.begin_result()
+    with pytest.raises(ContractError, match="Small, agent 3: came from Big without a terminal record"):
+        lives.ask("Small", steps)
+
+
 def test_masks_are_obeyed_and_a_full_mask_is_an_error() -> None:
     spec = Ball3D.BEHAVIORS[0].spec()._replace()
     spec = spec._replace(action_spec=spec.action_spec.create_discrete((3,)))
@@ -141,6 +163,11 @@ def test_masks_are_obeyed_and_a_full_mask_is_an_error() -> None:
 def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["3DBall", "--steps", "200"]) == 0
     out = capsys.readouterr().out
-    assert "terminal_only_steps" in out and "'get_state/set_state', 'seed'" in out
-    assert main(["4DBall"]) == 1
+    assert (
+        "steps with ends only; checked: specs, records, errors, reset, get_state/set_state, seed, close"
+        in out
+    )
+    assert main(["3DBall", "env.params.mass=2", "--steps", "5"]) == 0
+    capsys.readouterr()
+    assert main(["4DBall"]) == 2
     assert "choices: 3DBall" in capsys.readouterr().err

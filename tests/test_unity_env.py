@@ -9,7 +9,7 @@ from mlagents_envs.base_env import ActionSpec
 from torchrl.envs.utils import check_env_specs
 
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.envs.rounds import EnvironmentDataError
+from mappo_unity.envs.contract import EnvironmentDataError
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.scenes import make_scene
 
@@ -217,6 +217,39 @@ def test_masks_turn_round_and_a_fully_masked_branch_names_the_agent():
     td["Fake", "action"] = torch.zeros(2, 1, 2, dtype=torch.int64)
     with pytest.raises(EnvironmentDataError, match="agent 3.*branch 0"):
         env.step(td)
+
+
+def test_a_decision_without_a_mask_forbids_nothing():
+    specs = {"Fake?team=0": behavior_spec(1, ActionSpec(0, (2,)))}
+    env, base = open_env([[R(0, mask=[[False, True]])], [R(0)], [R(0)]], specs=specs)
+    give = base.get_steps
+
+    def give_no_mask(name):
+        decision, terminal = give(name)
+        decision.action_mask = decision.action_mask if base.at == 0 else None
+        return decision, terminal
+
+    base.get_steps = give_no_mask
+    td = env.reset()
+    assert td["Fake", "action_mask"].flatten().tolist() == [True, False]
+    td["Fake", "action"] = torch.zeros(1, 1, 1, dtype=torch.int64)
+    assert env.step(td)["next", "Fake", "action_mask"].flatten().tolist() == [True, True]
+
+
+def test_an_environment_may_write_into_the_same_arrays_again():
+    env, base = open_env([[R(0), R(1)], [R(0, obs=7, ends=END)], [R(1, obs=3), R(0, obs=4)]])
+    give, seen = base.get_steps, np.zeros((2, 1), np.float32)
+
+    def give_the_same_array(name):
+        for steps in (result := give(name)):
+            if len(steps):
+                seen[: len(steps)] = steps.obs[0]
+                steps.obs = [seen[: len(steps)]]
+        return result
+
+    base.get_steps = give_the_same_array
+    rows, _ = play(env, 1)
+    assert rows["next", "Fake", "obs_0"].flatten().tolist() == [7, 3]
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])

@@ -7,8 +7,6 @@ Every mistake is a ConfigError. Nothing is created here, and torch is not import
 from __future__ import annotations
 
 import importlib
-import os
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +31,8 @@ from mappo_unity.config.overrides import (
 )
 from mappo_unity.config.presets import conf_dir, group_choices
 from mappo_unity.config.schema import Config, ConfigError
-from mappo_unity.runs.folder import CONFIG, find_run
+from mappo_unity.runs.folder import CONFIG, factory_folder, find_run
+from mappo_unity.user_modules import add_working_directory, look_in
 
 _ALWAYS_SAVED = ("env", "output_dir")
 """The first and the last option of a run's config.yaml: a file that lacks one has been cut off."""
@@ -123,6 +122,8 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
             "numbers go on where they were; leave seed out, or start a new run without resume"
         )
     check_effect(rest, [config])
+    if config.env.factory is not None:
+        look_in(factory_folder(base.parent), config.env.factory, base.parent)
     return config
 
 
@@ -139,17 +140,22 @@ def load_config(path: Path) -> Config:
 def config_to_play(run: Path, env: str | None) -> Config:
     """Return the options of the environment in which a run or an ONNX file is played; raise ConfigError.
 
-    `env` names a preset; without it it is that of the run's folder, or of the one the file lies in.
+    `env` names a preset; without it it is that of the run's folder, or of the one the file lies in. Then the
+    module of env.factory may also lie where the run found it.
     """
     if env is not None:
         return compose_config([f"env={env}"]).config
     try:
-        return load_config(find_run(run, "run") / CONFIG)
+        folder = find_run(run, "run")
+        config = load_config(folder / CONFIG)
     except ConfigError as error:
         if not run.is_file() and not list(run.glob("*.onnx")):
             raise
         choices = ", ".join(group_choices()["env"])
         raise ConfigError(f"{error}; or say in which environment to play it: env=NAME ({choices})") from error
+    if config.env.factory is not None:
+        look_in(factory_folder(folder), config.env.factory, folder)
+    return config
 
 
 def to_config(tree: DictConfig) -> Config:
@@ -193,8 +199,7 @@ def check_factory(config: Config) -> None:
     factory = config.env.factory
     if factory is None:
         return
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
+    add_working_directory()
     module_name, _, name = factory.partition(":")
     try:
         module = importlib.import_module(module_name)

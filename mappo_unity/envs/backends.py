@@ -163,7 +163,7 @@ def _describe(cfg: EnvConfig) -> str:
 def _custom(cfg: EnvConfig) -> MakeEnv:
     name = f"env.factory={cfg.factory}"
     factory = load_factory(str(cfg.factory), name)
-    return lambda seed: GuardedEnv(call_factory(factory, name, seed, cfg.params), name, _raised)
+    return lambda seed: GuardedEnv(call_factory(factory, name, seed, cfg.params), name, explain_error)
 
 
 def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapping[str, Any]) -> BaseEnv:
@@ -180,7 +180,7 @@ def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapp
     except (ConfigError, EnvironmentFailure):
         raise
     except Exception as error:
-        raise _raised(error, name) from error
+        raise explain_error(error, name) from error
     if not isinstance(env, BaseEnv):
         raise ConfigError(
             f"{name} returned a {type(env).__name__}; it must return a mlagents_envs.base_env.BaseEnv"
@@ -211,7 +211,7 @@ def load_factory(path: str, name: str) -> Callable[..., Any]:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:  # the user's module raises what it likes
-        raise _raised(error, f"{name}: module {module_name!r} cannot be imported: it") from error
+        raise explain_error(error, f"{name}: module {module_name!r} cannot be imported: it") from error
     function = getattr(module, function_name, None)
     if not callable(function):
         names = sorted(n for n, v in vars(module).items() if callable(v) and not n.startswith("_"))
@@ -221,7 +221,7 @@ def load_factory(path: str, name: str) -> Callable[..., Any]:
     return function
 
 
-def _raised(error: BaseException, who: str) -> ConfigError:
+def explain_error(error: BaseException, who: str) -> ConfigError:
     """Return the mistake "`who` raised ..." with the traceback of the user's code, without our frames."""
     text = str(error).strip()
     mistake = ConfigError(

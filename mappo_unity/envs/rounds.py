@@ -1,7 +1,7 @@
 """One behavior's side of a round: records of a BaseEnv gathered into arrays of slots.
 
-In: DecisionSteps and TerminalSteps, as many results as a round takes. Out: numpy arrays ``[N, ...]``
-(N = G * A slots), ready to become tensors. Knows nothing of TensorDict.
+In: DecisionSteps and TerminalSteps (checked by `record_check`), as many results as a round takes. Out: numpy
+arrays ``[N, ...]`` (N = G * A slots), ready to become tensors. Knows nothing of TensorDict.
 
 A round begins when actions are handed over and ends with the first result in which anybody is
 asked. What arrives in it for a slot is added up: the reward of a terminal step belongs to the row
@@ -19,12 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.envs.contract import EnvironmentDataError as EnvironmentDataError
 from mappo_unity.envs.slots import SlotTable
-
-
-class EnvironmentDataError(ConfigError):
-    """An environment sent numbers that nobody can learn from."""
 
 
 class Episode(NamedTuple):
@@ -126,7 +122,6 @@ class BehaviorRounds:
         return out
 
     def _add_terminal(self, terminal: TerminalSteps) -> None:
-        self._check(terminal, "terminal")
         slots = self.slots.lookup(terminal.agent_id)
         own = slots >= 0
         if own.any():
@@ -152,15 +147,14 @@ class BehaviorRounds:
             self.present[rows[leaves]] = True
             for o in self.obs:
                 o[rows[leaves]] = 0
-        ends = rows[~leaves]
-        self.terminated[ends] = ~interrupted[~leaves]
-        self.truncated[ends] = interrupted[~leaves]
-        self._terminal_obs.append(
-            (ends, [o[~leaves] for o in observations] if leaves.any() else observations)
-        )
+        over = ~leaves
+        ends = rows[over]
+        self.terminated[ends] = ~interrupted[over]
+        self.truncated[ends] = interrupted[over]
+        # copies: an environment may write its next observations into the same arrays
+        self._terminal_obs.append((ends, [o[over] for o in observations]))
 
     def _add_decision(self, decision: DecisionSteps) -> None:
-        self._check(decision, "decision")
         slots = self.slots.assign(decision.agent_id, decision.group_id)
         self.individual_return[slots] += decision.reward
         self.group_return[slots] += decision.group_reward
@@ -182,9 +176,9 @@ class BehaviorRounds:
             self._share_group_reward(slots, decision.group_reward)
         for own, new in zip(self.obs, decision.obs):
             own[slots] = new
-        if decision.action_mask is not None:
-            self.mask[slots] = ~np.concatenate(decision.action_mask, axis=1).astype(bool)
-            self._check_mask(decision)
+        if self.mask.shape[1]:
+            masks = decision.action_mask
+            self.mask[slots] = True if masks is None else ~np.concatenate(masks, axis=1)
         self.acting[slots] = True
         self.order = slots
 
@@ -224,34 +218,6 @@ class BehaviorRounds:
         share[teams] = group_reward[first]
         departed = np.flatnonzero(self.departed)
         self.group_reward[departed] += share[departed // self.slots.team_size]
-
-    def _check(self, steps: DecisionSteps | TerminalSteps, kind: str) -> None:
-        for index, obs in enumerate(steps.obs):
-            if not np.isfinite(obs).all():
-                self._refuse(
-                    steps, obs, f"sensor obs_{index} ({self.spec.observation_specs[index].name})", kind
-                )
-        for what, values in (("reward", steps.reward), ("group reward", steps.group_reward)):
-            if not np.isfinite(values).all():
-                self._refuse(steps, values, what, kind)
-
-    def _refuse(self, steps: DecisionSteps | TerminalSteps, values: np.ndarray, what: str, kind: str) -> None:
-        row = int(np.argwhere(~np.isfinite(values))[0][0])
-        value = values[row][~np.isfinite(values[row])].flat[0] if values.ndim > 1 else values[row]
-        raise EnvironmentDataError(
-            f"behavior {self.name!r}, agent {int(steps.agent_id[row])}: its {what} holds {value} in a {kind} "
-            "step; every number that an environment sends must be finite"
-        )
-
-    def _check_mask(self, decision: DecisionSteps) -> None:
-        for branch, forbidden in enumerate(decision.action_mask or []):
-            full = np.atleast_1d(np.asarray(forbidden, bool).all(axis=1))
-            if full.any():
-                agent = int(decision.agent_id[int(np.argmax(full))])
-                raise EnvironmentDataError(
-                    f"behavior {self.name!r}, agent {agent}: every action of discrete branch {branch} is "
-                    "masked; at least one action of a branch must be allowed"
-                )
 
     _ARRAYS = (
         *("acting", "present", "departed", "order", "mask"),

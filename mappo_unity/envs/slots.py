@@ -66,7 +66,8 @@ class SlotTable:
         if not len(left):
             raise ConfigError(
                 f"behavior {self.behavior!r}: agent {agent} is one more than the {self.team_size} slots of "
-                f"its team (group {group}); give room with env.max_team_size={self.team_size + 1} or more"
+                f"its team (group {group}); give room with env.max_team_size={self.team_size + 1} or more (a "
+                "member makes room with its terminal step)"
             )
         slot = team * self.team_size + int(left[0])
         self._slot_of.pop(int(self.agent_id[slot]), None)
@@ -87,7 +88,8 @@ class SlotTable:
         if not len(free):
             raise ConfigError(
                 f"behavior {self.behavior!r}: agent {agent} begins one more team than the {self.num_teams} "
-                f"team slots; give room with env.max_teams={self.num_teams + 1} or more"
+                f"team slots; give room with env.max_teams={self.num_teams + 1} or more (a team makes room "
+                "with the terminal steps of its members)"
             )
         team = int(free[0])
         members = slice(team * self.team_size, (team + 1) * self.team_size)

@@ -22,12 +22,17 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from mappo_unity import keys
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.envs.contract import (
+    MAX_SILENT_STEPS,
+    check_plain,
+    check_same_specs,
+    note_silence,
+    silence_error,
+)
+from mappo_unity.envs.opening import first_results, team_sizes
 from mappo_unity.envs.rounds import BehaviorRounds, Episode
-from mappo_unity.envs.slots import SlotTable, count_teams
+from mappo_unity.envs.slots import SlotTable
 from mappo_unity.envs.specs import make_specs
-
-MAX_SILENT_STEPS = 100_000  # BaseEnv steps in which nobody asks before that is called an error
 
 
 class CutOff(NamedTuple):
@@ -106,7 +111,7 @@ class UnityEnv(EnvBase):
     def get_state(self) -> dict[str, Any] | None:
         """Return a snapshot between two rounds, or None if the BaseEnv cannot give one."""
         snapshot = getattr(self.base_env, "get_state", None)
-        if snapshot is None:
+        if snapshot is None or not hasattr(self.base_env, "set_state"):
             return None
         return {
             "scene": snapshot(),
@@ -151,8 +156,6 @@ class UnityEnv(EnvBase):
         self._untouched = False
         self._play_until_asked()
         self._note_cut_off()
-        if self.restarts is not None:
-            self._check_behaviors()
         self.rounds += 1
         following = {self.entry_of[name]: self._next(b) for name, b in self._behaviors.items()}
         return unchecked(following, self.batch_size)
@@ -168,6 +171,9 @@ class UnityEnv(EnvBase):
         try:
             self.base_env.reset()
             self._first_results()
+            state = self.get_state()
+            if state is not None:  # what a checkpoint could not give back is seen before anything is learnt
+                check_plain(state["scene"], "get_state()")
         except BaseException:
             self.base_env.close()
             raise
@@ -186,32 +192,29 @@ class UnityEnv(EnvBase):
         for attempt in range(MAX_SILENT_STEPS):
             if step_first or attempt:
                 self.base_env.step()
-            asked = False
-            cut_off = getattr(self.base_env, "cut_off", None)  # a restarted player's, see link.restarts
-            for name, behavior in self._behaviors.items():
-                decision, terminal = self.base_env.get_steps(name)
-                if cut_off and name in cut_off:
-                    behavior.drop(cut_off[name])
-                behavior.add(decision, terminal)
-                asked = asked or len(decision) > 0
-            if asked:
+            if not attempt:
+                check_same_specs(self.base_env.behavior_specs, self._specs)
+            if self._take_results():
                 break
+            note_silence(attempt, MAX_SILENT_STEPS)
         else:
-            raise ConfigError(
-                f"no agent asked for a decision in {MAX_SILENT_STEPS} environment steps; "
-                "does every agent of the scene have a DecisionRequester?"
-            )
+            raise silence_error(MAX_SILENT_STEPS)
+
         for behavior in self._behaviors.values():
             behavior.end_round()
 
-    def _check_behaviors(self) -> None:
-        """Refuse behaviors that a player shows after the start: their agents would never act."""
-        late = [name for name in self.base_env.behavior_specs if name not in self._behaviors]
-        if late:
-            raise ConfigError(
-                f"behavior {late[0]!r} appeared after the start, when there were {list(self._behaviors)}: "
-                "its networks cannot be made any more; let every behavior have an active agent at first"
-            )
+    def _take_results(self) -> bool:
+        """Take in what the behaviors' agents report; return whether somebody asks."""
+        cut_off = getattr(self.base_env, "cut_off", None)  # a restarted player's, see link.restarts
+        asked = False
+
+        for name, behavior in self._behaviors.items():
+            decision, terminal = self._checks[name](self.base_env.get_steps(name))
+            if cut_off and name in cut_off:
+                behavior.drop(cut_off[name])
+            behavior.add(decision, terminal)
+            asked = asked or len(decision) > 0
+        return asked
 
     def _note_cut_off(self) -> None:
         for name, behavior in self._behaviors.items():
@@ -221,31 +224,20 @@ class UnityEnv(EnvBase):
 
     def _first_results(self) -> None:
         """Read the behaviors and how many teams and agents they have from the first records."""
-        for _ in range(MAX_SILENT_STEPS):
-            names = list(self.base_env.behavior_specs)
-            decisions = {name: self.base_env.get_steps(name)[0] for name in names}
-            if any(len(d) for d in decisions.values()):
-                break
-            self.base_env.step()
-        else:
-            raise ConfigError("the environment shows no behavior with an agent that asks for a decision")
-        sizes: dict[str, tuple[int, int]] = {}
-        for name in names:
-            policy = keys.policy_name(name)
-            teams, members = count_teams(decisions[name].agent_id, decisions[name].group_id)
-            seen = sizes.get(policy, (1, 1))
-            sizes[policy] = max(seen[0], teams), max(seen[1], members)
-        for name in names:
-            teams, members = (
-                limit or seen for limit, seen in zip(self._limits, sizes[keys.policy_name(name)])
-            )
+        first = first_results(self.base_env, MAX_SILENT_STEPS)
+        self._specs = {name: seen.spec for name, seen in first.items()}
+        self._checks = {name: seen.check for name, seen in first.items()}
+
+        for name, sizes in team_sizes(first).items():
+            teams, members = (limit or seen for limit, seen in zip(self._limits, sizes))
             table = SlotTable(name, teams, members)
-            behavior = BehaviorRounds(name, self.base_env.behavior_specs[name], table, self.death_masking)
-            behavior.add(decisions[name], self.base_env.get_steps(name)[1])
+            behavior = BehaviorRounds(name, self._specs[name], table, self.death_masking)
+            behavior.add(first[name].decision, first[name].terminal)
             behavior.end_round()
             self._behaviors[name] = behavior
-        self.sides = {keys.policy_name(n): [] for n in names}
-        for name in names:
+
+        self.sides = {keys.policy_name(n): [] for n in first}
+        for name in first:
             self.sides[keys.policy_name(name)].append(name)
         self.entry_of = {n: p if len(sides) == 1 else n for p, sides in self.sides.items() for n in sides}
 

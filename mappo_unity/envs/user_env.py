@@ -1,11 +1,13 @@
 """A user's environment, whose errors are told as the user's.
 
-In: a BaseEnv made by env.factory. Out: the same, but whatever it raises ends the run as an
-`EnvironmentFailure` with the user's frames of the traceback. Knows nothing of options.
+In: a BaseEnv made by env.factory. Out: the same, but whatever it raises ends the run as a `ConfigError`
+(before its first step) or an `EnvironmentFailure`, with the user's frames of the traceback; a `close` that
+raises is only noted, because what was done before stands. Knows nothing of options.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -14,6 +16,8 @@ from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, Decisi
 from mappo_unity.config.schema import ConfigError, EnvironmentFailure
 
 Result = TypeVar("Result")
+
+logger = logging.getLogger(__name__)
 
 
 class GuardedEnv(BaseEnv):
@@ -27,9 +31,15 @@ class GuardedEnv(BaseEnv):
 
     def __init__(self, env: BaseEnv, name: str, explain: Callable[[BaseException, str], ConfigError]) -> None:
         self._env, self._name, self._explain = env, name, explain
+        self._has_stepped = False
 
     def __getattr__(self, attribute: str) -> Any:
-        return getattr(self._env, attribute)
+        if attribute == "_env":  # not there yet, in a copy that is being made
+            raise AttributeError(attribute)
+        value = getattr(self._env, attribute)
+        if attribute in ("get_state", "set_state"):
+            return lambda *arguments: self._call(attribute, value, *arguments)
+        return value
 
     @property
     def behavior_specs(self) -> BehaviorMapping:
@@ -38,6 +48,7 @@ class GuardedEnv(BaseEnv):
 
     def step(self) -> None:
         """Step the environment."""
+        self._has_stepped = True
         self._call("step", self._env.step)
 
     def reset(self) -> None:
@@ -45,8 +56,12 @@ class GuardedEnv(BaseEnv):
         self._call("reset", self._env.reset)
 
     def close(self) -> None:
-        """Close the environment."""
-        self._call("close", self._env.close)
+        """Close the environment; log a warning if it cannot be closed."""
+        try:
+            self._env.close()
+        except (Exception, SystemExit) as error:
+            mistake = self._explain(error, f"{self._name}: its close")
+            logger.warning("%s", "\n".join([f"{mistake}; what was done before stands", *mistake.details]))
 
     def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
         """Hand the actions of a behavior's agents on."""
@@ -67,6 +82,8 @@ class GuardedEnv(BaseEnv):
             raise
         except (Exception, SystemExit) as error:
             mistake = self._explain(error, f"{self._name}: its {method}")
+            if not self._has_stepped:
+                raise mistake from error
             failure = EnvironmentFailure(str(mistake))
             failure.details = mistake.details
             raise failure from error

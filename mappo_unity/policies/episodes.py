@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
+from mappo_unity.config.schema import ConfigError
+from mappo_unity.envs.contract import MAX_SILENT_STEPS, check_specs, note_silence, silence_error
+from mappo_unity.envs.record_check import RecordCheck
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.policies.policy import Policy
 
@@ -28,24 +31,43 @@ def play(
 
     Returns:
         The episodes of every behavior, in the order of their ends.
+
+    Raises:
+        EnvironmentDataError: the environment sent what breaks its contract, or nobody asks any more.
+        ConfigError: the episodes are too many to wait for.
     """
     running: dict[tuple[str, int], list[float]] = {}
     counts = _Counts(episodes)
+    checks: dict[str, RecordCheck] = {}
+    silent = 0  # steps in a row in which nobody asked
     env.reset()
+    check_specs(env.behavior_specs)
     for _ in range(MAX_ENV_STEPS):
+        silent += 1
         for name in env.behavior_specs:
-            decision, terminal = env.get_steps(name)
+            if name not in checks:
+                checks[name] = RecordCheck(name, env.behavior_specs[name])
+            decision, terminal = checks[name](env.get_steps(name))
             _drop_cut_off(env, name, running, counts)
             _end_episodes(name, terminal, running, counts)
             actor = policy[name] if isinstance(policy, dict) else policy
             actor.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
             _go_on(name, decision, running, counts)
             if len(decision):
+                silent = 0
                 env.set_actions(name, actor.act(name, decision, env.behavior_specs[name]))
-        if counts.complete([only] if only else list(env.behavior_specs)):
+        names = [only] if only else list(env.behavior_specs)
+        if names and counts.complete(names):
             return counts.ended
+        note_silence(silent, MAX_SILENT_STEPS)
+        if silent >= MAX_SILENT_STEPS:
+            raise silence_error(silent)
         env.step()
-    raise RuntimeError(f"{episodes} episodes did not end within {MAX_ENV_STEPS} environment steps")
+    ended = {name: len(counts.ended.get(name, [])) for name in env.behavior_specs}
+    raise ConfigError(
+        f"episodes={episodes}: so many did not end within {MAX_ENV_STEPS:,} environment steps; ended: "
+        f"{ended}; do its episodes end, by a goal or a time limit (terminal steps)?"
+    )
 
 
 class _Counts:

@@ -24,9 +24,11 @@ from mappo_unity.config.overrides import shell_argument
 from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.lock import LOCK
+from mappo_unity.user_modules import folder_of
 
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
 RECORD = (CONFIG, OVERRIDES, VERSIONS)
+FACTORY_FOLDER = "factory_folder"  # in versions.json
 PLAYERS = "players"  # the folder of their logs
 _NO_WORK = (*RECORD, LOCK)  # files of a run that trained nothing
 _PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "numpy", "mlagents-envs", "protobuf", "hydra-core")
@@ -82,14 +84,18 @@ def discard_folder(folder: NewFolder, reason: BaseException | None = None) -> No
 def write_record(folder: Path, config: Config, lines: list[str]) -> None:
     """Write config.yaml and versions.json, and add the command line to overrides.yaml.
 
-    `resume` is left out of config.yaml: it says how a run was called, not what it is.
+    `resume` is left out of config.yaml: it says how a run was called, not what it is. versions.json also says
+    in which folder the module of env.factory was found.
     """
     lasting = replace(config, resume=None)
     history = _history(folder / OVERRIDES)
+    versions = read_versions()
+    if config.env.factory is not None:
+        versions[FACTORY_FOLDER] = str(folder_of(config.env.factory) or "") or None
     history.append({"date": datetime.now().astimezone().isoformat(timespec="seconds"), "overrides": lines})
     try:
         write_atomically(folder / OVERRIDES, OmegaConf.to_yaml(OmegaConf.create(history)).encode())
-        write_atomically(folder / VERSIONS, (json.dumps(read_versions(), indent=2) + "\n").encode())
+        write_atomically(folder / VERSIONS, (json.dumps(versions, indent=2) + "\n").encode())
         write_atomically(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(lasting)).encode())
     except OSError as error:
         raise ConfigError(f"the run folder {folder} cannot be written ({error.strerror or error})") from error
@@ -139,6 +145,15 @@ def find_run(path: Path, option: str) -> Path:
     raise ConfigError(
         f"{option}={path} is neither a run folder nor a checkpoint in one: no {CONFIG} there{_runs_in(path)}"
     )
+
+
+def factory_folder(folder: Path) -> Path | None:
+    """Return the folder in which a run found the module of env.factory; None: its record does not say."""
+    try:
+        found = json.loads((folder / VERSIONS).read_text(encoding="utf-8")).get(FACTORY_FOLDER)
+    except (OSError, ValueError, AttributeError):
+        return None
+    return Path(found) if isinstance(found, str) and found else None
 
 
 def read_versions() -> dict[str, Any]:

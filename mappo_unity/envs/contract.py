@@ -1,0 +1,184 @@
+"""What a BaseEnv must show before anybody can play it: behaviors with sensors and actions, agents that ask.
+
+In: `behavior_specs`, counts of steps. Out: nothing, or an `EnvironmentDataError` that names the behavior and
+the rule. `record_check` looks at what the agents send.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from mlagents_envs.base_env import ActionSpec, BehaviorSpec, ObservationSpec
+
+from mappo_unity.config.schema import ConfigError
+
+MAX_SILENT_STEPS = 100_000  # BaseEnv steps in a row in which nobody asks before that is called an error
+SILENCE_NOTED = 1_000  # steps in a row after which it is said
+LISTS = (tuple, list)
+
+logger = logging.getLogger(__name__)
+
+
+class EnvironmentDataError(ConfigError):
+    """An environment sent what nobody can learn from."""
+
+
+class ContractError(AssertionError):
+    """A broken rule of the BaseEnv contract, found by the checker (`scenes.check`).
+
+    `details`: lines to print below it, such as a traceback of the user's code.
+    """
+
+    details: tuple[str, ...] = ()
+
+
+def check_specs(specs: Any) -> None:
+    """Check the behaviors that an environment shows; there may be none yet.
+
+    Raises:
+        EnvironmentDataError: names the behavior that nobody can play, and why.
+    """
+    if not isinstance(specs, Mapping):
+        raise EnvironmentDataError(
+            f"behavior_specs is {show_kind(specs)}; it must be a mapping (a dict) of names to BehaviorSpec"
+        )
+    for name, spec in specs.items():
+        if not isinstance(name, str) or not name:
+            raise EnvironmentDataError(
+                f"behavior_specs has a name {name!r}; names must be texts: Game?team=0"
+            )
+        _, query, team = name.partition("?team=")
+        if query and not team.isdigit():
+            raise EnvironmentDataError(
+                f"behavior {name!r}: what follows ?team= must be a whole number: 0, 1 ..."
+            )
+        if not isinstance(spec, BehaviorSpec):
+            raise EnvironmentDataError(
+                f"behavior {name!r}: its spec is {show_kind(spec)}; it must be a BehaviorSpec"
+            )
+        _check_spec(name, spec)
+
+
+def check_same_specs(specs: Any, first: Mapping[str, BehaviorSpec]) -> None:
+    """Check that an environment still shows the behaviors that it showed at first.
+
+    Raises:
+        EnvironmentDataError: one has vanished, has changed or is new (its networks cannot be made any more).
+    """
+    if _are_same(specs, first):
+        return
+    check_specs(specs)
+    for name, spec in first.items():
+        if name not in specs:
+            raise EnvironmentDataError(
+                f"behavior {name!r} has vanished: behavior_specs has {list(specs)} now, at the start "
+                f"{list(first)}; a behavior without agents stays in behavior_specs"
+            )
+        if specs[name] != spec:
+            raise EnvironmentDataError(
+                f"behavior {name!r} has changed its spec: {specs[name]} now, {spec} at the start"
+            )
+    for name in specs:
+        if name not in first:
+            raise EnvironmentDataError(
+                f"behavior {name!r} appeared after the start, when there were {list(first)}: "
+                "its networks cannot be made any more; let every behavior have an active agent at first"
+            )
+
+
+def check_plain(value: Any, where: str) -> None:
+    """Check that a snapshot holds nothing but dicts, lists, arrays and plain values.
+
+    Raises:
+        EnvironmentDataError: it holds what no checkpoint gives back, named by its place below `where`.
+    """
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise EnvironmentDataError(f"{where} has a key {key!r} that is no string")
+            check_plain(item, f"{where}[{key!r}]")
+    elif isinstance(value, list):
+        for number, item in enumerate(value):
+            check_plain(item, f"{where}[{number}]")
+    else:
+        is_array = isinstance(value, (np.ndarray, np.generic)) and value.dtype != object
+        if not is_array and type(value) not in (int, float, str, bool, type(None)):
+            raise EnvironmentDataError(
+                f"{where} is {type(value).__name__}, not an array or a plain value; checkpoints hold dicts, "
+                "lists, NumPy arrays, numbers, texts, True, False and None"
+            )
+
+
+def note_silence(steps: int, limit: int) -> None:
+    """Say once, after some steps in which nobody asked, how long that is borne."""
+    if steps == SILENCE_NOTED:
+        logger.warning(
+            "no agent has requested a decision for %d environment steps in a row; after %d that is an error",
+            *(steps, limit),
+        )
+
+
+def silence_error(steps: int) -> EnvironmentDataError:
+    """Return the error of an environment in which nobody asks any more."""
+    return EnvironmentDataError(
+        f"no agent asked for a decision in {steps} environment steps in a row: get_steps gave no "
+        "DecisionSteps. In Unity every agent needs a DecisionRequester; step() of an environment of your own "
+        "goes on until some agent asks"
+    )
+
+
+def sensor_name(spec: BehaviorSpec, index: int) -> str:
+    """Return what messages call a sensor."""
+    return f"obs_{index} ({spec.observation_specs[index].name})"
+
+
+def show_kind(value: Any) -> str:
+    """Return what a message calls a value that is not what it should be."""
+    return "None" if value is None else f"a {type(value).__name__}"
+
+
+def _are_same(specs: Any, first: Mapping[str, BehaviorSpec]) -> bool:
+    """Whether these are the very same specs; quick, since it is asked in every round."""
+    try:
+        return len(specs) == len(first) and all(specs[name] is spec for name, spec in first.items())
+    except (KeyError, TypeError):
+        return False
+
+
+def _check_spec(name: str, spec: BehaviorSpec) -> None:
+    sensors, actions = spec.observation_specs, spec.action_spec
+    if not isinstance(sensors, LISTS) or not all(isinstance(sensor, ObservationSpec) for sensor in sensors):
+        raise EnvironmentDataError(
+            f"behavior {name!r}: observation_specs is {sensors!r}; it must be a list of ObservationSpec"
+        )
+    if not sensors:
+        raise EnvironmentDataError(f"behavior {name!r} has no observation: observation_specs is empty")
+    for index, sensor in enumerate(sensors):
+        shape = sensor.shape
+        if not isinstance(shape, LISTS) or not shape or not all(_is_size(size) for size in shape):
+            raise EnvironmentDataError(
+                f"behavior {name!r}: sensor {sensor_name(spec, index)} has shape {shape!r}; it must be a "
+                "tuple of whole numbers >= 1, such as (8,)"
+            )
+
+    if not isinstance(actions, ActionSpec):
+        raise EnvironmentDataError(
+            f"behavior {name!r}: action_spec is {show_kind(actions)}; it must be an ActionSpec"
+        )
+    continuous, branches = actions
+    if not _is_size(continuous, 0) or not isinstance(branches, LISTS) or not all(map(_is_size, branches)):
+        raise EnvironmentDataError(
+            f"behavior {name!r}: continuous_size {continuous!r} must be a whole number >= 0, "
+            f"discrete_branches {branches!r} a tuple of whole numbers >= 1"
+        )
+    if not continuous and not branches:
+        raise EnvironmentDataError(
+            f"behavior {name!r} has no action: ActionSpec(0, ()) leaves nothing to choose"
+        )
+
+
+def _is_size(value: Any, low: int = 1) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= low)

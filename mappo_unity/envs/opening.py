@@ -1,0 +1,67 @@
+"""What an environment shows at first: its behaviors, and how many teams and agents they have.
+
+In: a BaseEnv that was reset, stepped here until somebody asks. Out: a `First` for each behavior. Knows
+nothing of what is done with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from mlagents_envs.base_env import BaseEnv, BehaviorSpec, DecisionSteps, TerminalSteps
+
+from mappo_unity import keys
+from mappo_unity.envs.contract import EnvironmentDataError, check_specs, note_silence
+from mappo_unity.envs.record_check import RecordCheck
+from mappo_unity.envs.slots import count_teams
+
+
+class First(NamedTuple):
+    """A behavior as it first showed."""
+
+    check: RecordCheck  # of its further results
+    decision: DecisionSteps
+    terminal: TerminalSteps
+
+    @property
+    def spec(self) -> BehaviorSpec:
+        """Its sensors and actions."""
+        return self.check.spec
+
+
+def first_results(env: BaseEnv, max_steps: int) -> dict[str, First]:
+    """Step an environment until somebody asks; return its behaviors by name.
+
+    Raises:
+        EnvironmentDataError: nobody asks within `max_steps`, or what it shows breaks the contract.
+    """
+    for attempt in range(max_steps):
+        check_specs(env.behavior_specs)
+        behaviors = {}
+        for name, spec in env.behavior_specs.items():
+            check = RecordCheck(name, spec)
+            behaviors[name] = First(check, *check(env.get_steps(name)))
+        if any(len(first.decision) for first in behaviors.values()):
+            return behaviors
+        note_silence(attempt, max_steps)
+        env.step()
+    what = (
+        f"get_steps gave no DecisionSteps of {list(behaviors)}"
+        if behaviors
+        else "behavior_specs stayed empty"
+    )
+    raise EnvironmentDataError(
+        f"the environment shows no behavior with an agent that asks for a decision: {what} in {max_steps} "
+        "steps after reset()"
+    )
+
+
+def team_sizes(behaviors: Mapping[str, First]) -> dict[str, tuple[int, int]]:
+    """Return of every behavior how many teams it has and the largest one's members: the most of any side."""
+    sizes: dict[str, tuple[int, int]] = {}
+    for name, first in behaviors.items():
+        teams, members = count_teams(first.decision.agent_id, first.decision.group_id)
+        seen = sizes.get(keys.policy_name(name), (1, 1))
+        sizes[keys.policy_name(name)] = max(seen[0], teams), max(seen[1], members)
+    return {name: sizes[keys.policy_name(name)] for name in behaviors}
