@@ -22,6 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from mappo_unity import keys
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.contract import (
     MAX_SILENT_STEPS,
     check_plain,
