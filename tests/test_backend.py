@@ -23,6 +23,8 @@ from mappo_unity.cli import train_main
 from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
 from mappo_unity.envs.backends import PLAYER_STRIDE, make_env_function
 from mappo_unity.protocol.parallel_players import SeveralPlayers
+from mappo_unity.protocol.ports import FORBIDDEN, check_port
+from mappo_unity.protocol.process import find_executable
 from mappo_unity.protocol.restarting_player import SEED_STRIDE, RestartingPlayer
 from mappo_unity.protocol.serve import main as player_main
 from mappo_unity.protocol.server import Link
@@ -411,13 +413,21 @@ class TestEditor:
         ):
             make_env_function(EnvConfig(backend=Backend.editor, port=port, timeout_s=0.5))(0)
 
-    def test_a_port_in_use(self) -> None:
+    def test_a_port_in_use(self, capfd: pytest.CaptureFixture[str]) -> None:
         with socket.socket() as holder:
             holder.bind(("127.0.0.1", 0))
             holder.listen()
             port = holder.getsockname()[1]
             with pytest.raises(ConfigError, match=f"port {port} of 127.0.0.1 is in use"):
                 make_env_function(EnvConfig(backend=Backend.editor, port=port, timeout_s=1))(0)
+        assert capfd.readouterr().err == ""  # no line of gRPC's
+
+    def test_a_port_that_this_user_may_not_have(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("mappo_unity.protocol.ports.port_state", lambda port: FORBIDDEN)
+        with pytest.raises(
+            ConfigError, match=r"port 80 of 127.0.0.1 may not be listened on.*1024 up \(env.port\)"
+        ):
+            check_port(80, "env.port")
 
 
 class TestRegistry:
@@ -554,6 +564,50 @@ class TestOptions:
         plain.write_text("")
         with pytest.raises(ConfigError, match="is not executable; run: chmod .x '/.*My Game.x86_64'"):
             make_env_function(options(str(plain), tmp_path))
+
+    @pytest.mark.skipif(os.name == "nt", reason="what is said of files differs there")
+    @pytest.mark.parametrize(
+        ("content", "words"),
+        [
+            (b"", "cannot be run on this system: it is empty"),
+            (b"echo hello\n", "it is a text without a first line such as #!/bin/sh"),
+            (b"#!/no/such/shell -e\n", "it is a script for '/no/such/shell -e', which is not there"),
+            (b"#!/bin/sh\r\nexit 3\r\n", r"it is a script for '/bin/sh\\r', which is not there"),
+            (b"MZ\x90\x00", "it is built for Windows; build one for this system"),
+        ],
+    )
+    def test_files_that_this_system_cannot_run(self, tmp_path: Path, content: bytes, words: str) -> None:
+        game = tmp_path / "Game"
+        game.write_bytes(content)
+        game.chmod(0o755)
+        with pytest.raises(ConfigError, match=words):
+            find_executable(str(game))
+
+    def test_folders_and_links_that_are_no_players(self, tmp_path: Path) -> None:
+        folder = tmp_path / "folder"
+        folder.mkdir()
+        (folder / "Game.x86_64").touch()
+        with pytest.raises(ConfigError, match=r"folder is a folder; players in it: Game.x86_64\)"):
+            find_executable(str(folder))
+        (tmp_path / "loop").symlink_to("loop")
+        with pytest.raises(
+            ConfigError, match="loop cannot be opened: it is a symbolic link that leads in a circle"
+        ):
+            find_executable(str(tmp_path / "loop"))
+        (tmp_path / "dangling").symlink_to("gone")
+        with pytest.raises(ConfigError, match="dangling is a symbolic link to gone, which does not exist"):
+            find_executable(str(tmp_path / "dangling"))
+        with pytest.raises(ConfigError, match="cannot be opened: File name too long"):
+            find_executable("a" * 300)
+        with pytest.raises(ConfigError, match="--file-name= is empty"):
+            find_executable("", "--file-name")
+
+    def test_a_player_in_a_folder_with_brackets_is_found(self, tmp_path: Path) -> None:
+        (tmp_path / "v[1]").mkdir()
+        game = tmp_path / "v[1]" / "Game"
+        game.write_text("#!/bin/sh\n")
+        game.chmod(0o755)
+        assert find_executable(str(game)) == game
 
     @pytest.mark.parametrize(
         ("fields", "words"),

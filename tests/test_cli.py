@@ -429,6 +429,7 @@ def test_evaluation_prints_a_table_and_one_line_of_json(
     module = ModuleType("mappo_unity.policies.evaluate")
     vars(module)["evaluate"] = evaluate
     monkeypatch.setitem(sys.modules, "mappo_unity.policies.evaluate", module)
+    monkeypatch.setattr("mappo_unity.cli.first_checks.check_evaluation", lambda config: None)
     train_main(["hydra.run.dir=mine"])
     capsys.readouterr()
     assert eval_main(["run=mine", "episodes=20", "deterministic=true"]) == 0
@@ -465,3 +466,22 @@ def test_a_mistake_in_an_evaluation_is_told(
     monkeypatch.chdir(tmp_path)
     assert eval_main(lines) == 2
     assert word in capsys.readouterr().err
+
+
+def test_what_a_file_system_refuses_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(lines: list[str]) -> int:
+        raise PermissionError(13, "Permission denied", "somewhere/config.yaml")
+
+    monkeypatch.setattr("mappo_unity.cli._eval_command", fail)
+    assert eval_main(["run=a"]) == 2
+    assert capsys.readouterr().err == "mappo-eval: somewhere/config.yaml: Permission denied\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+def test_an_output_that_is_full_is_one_line() -> None:
+    code = "import sys; from mappo_unity.cli import eval_main; sys.exit(eval_main(['--version']))"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (2, "mappo-eval: its output: No space left on device\n")

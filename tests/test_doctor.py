@@ -64,15 +64,18 @@ def test_a_sound_player_is_described(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("mode", "after", "words"),
     [
-        ("silent", 2, CURES["no behavior"]),
-        ("exit", 0, "exit code 7; its log"),
-        ("version", 0, "speaks version '2.0.0'"),
-        ("hang", 2, "DecisionRequester"),
+        ("silent", 2, [CURES["no behavior"]]),
+        ("exit", 0, ["exit code 7; its log"]),
+        ("version", 0, ["speaks version '2.0.0'", CURES["old package"]]),
+        ("hang", 2, ["DecisionRequester"]),
+        ("crash", 9, ["killed by SIGKILL; its log", CURES["log"]]),
     ],
 )
-def test_a_sick_player_is_told_its_cure(tmp_path: Path, mode: str, after: int, words: str) -> None:
-    code, text = examine("--file-name", bad_player(tmp_path, mode, after), "--timeout-s", "3")
-    assert code == 1 and "FAIL" in text and words in text
+def test_a_sick_player_is_told_its_cure(tmp_path: Path, mode: str, after: int, words: list[str]) -> None:
+    patience_s = "5" if mode == "hang" else "20"
+    code, text = examine("--file-name", bad_player(tmp_path, mode, after), "--timeout-s", patience_s)
+    assert code == 1 and "FAIL" in text
+    assert all(part in text for part in words), text
 
 
 def test_a_player_without_a_log_is_not_said_to_have_one(tmp_path: Path) -> None:
@@ -89,6 +92,44 @@ def test_files_that_are_no_players(tmp_path: Path) -> None:
     (tmp_path / "Game.x86_64").write_text("")
     code, text = examine("--file-name", str(tmp_path / "Game"))
     assert code == 1 and "chmod +x" in text
+    (tmp_path / "Game.x86_64").chmod(0o755)
+    code, text = examine("--file-name", str(tmp_path / "Game"))
+    assert code == 1 and "cannot be run on this system: it is empty" in text
+    code, text = examine("--file-name", "")
+    assert code == 1 and "--file-name= is empty" in text
+
+
+def test_a_taken_port_is_one_finding_and_no_line_of_grpc(capfd: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        port = server.getsockname()[1]
+        code, text = examine("--editor", "--port", str(port))
+    assert code == 1 and f"port {port} of 127.0.0.1 is in use" in text and "(--port) on both sides" in text
+    assert capfd.readouterr().err == ""
+
+
+def test_nothing_is_left_of_a_sound_player(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "doctor"
+    monkeypatch.setattr("mappo_unity.cli.doctor_player.tempfile.mkdtemp", lambda prefix: str(folder))
+    monkeypatch.setattr(
+        "mappo_unity.cli.doctor_player._examine_running",
+        lambda report, options, game, log: log.parent.mkdir(),
+    )
+    (tmp_path / "Game").write_text("#!/bin/sh\n")
+    (tmp_path / "Game").chmod(0o755)
+    assert examine("--file-name", str(tmp_path / "Game"))[0] == 0 and not folder.exists()
+
+
+def test_an_opengl_that_keeps_mujoco_from_loading(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str) -> None:
+        raise AttributeError("'NoneType' object has no attribute 'glGetError'")
+
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr("mappo_unity.policies.screens.importlib.import_module", fail)
+    code, text = examine()
+    assert code == 1 and "environment variable MUJOCO_GL=osmesa ('NoneType' object has no attribute" in text
+    assert "unset it, or set it to egl or osmesa and install that" in text
 
 
 def test_the_editor_presses_play(tmp_path: Path) -> None:
@@ -143,8 +184,28 @@ def test_mistakes_in_the_options(capsys: Any) -> None:
     assert doctor_main(["--fil-name", "Game"]) == 2
     assert doctor_main(["--file-name", "Game", "--editor"]) == 2
     assert "not allowed with" in capsys.readouterr().err
+    for lines, words in (
+        (["--fil-name", "Game"], "--fil-name is not an option of mappo-doctor (did you mean --file-name?)"),
+        (["--port", "many"], "--port: 'many' is not a whole number"),
+        (["--seconds", "x"], "--seconds: 'x' is not a number"),
+        (["--port", "1", "--port", "2"], "--port is given twice, 1 and 2"),
+        (["Game"], "(did you mean --file-name Game?)"),
+        (["env.file_name=Game"], "(did you mean --file-name Game?)"),
+        (["--no-graphics"], "--no-graphics is for a player that is started: it needs --file-name GAME"),
+        (["--editor", "--argument=x"], "--argument is for a player that is started"),
+    ):
+        assert doctor_main(lines) == 2
+        told = capsys.readouterr().err
+        assert words in told and told.count("\n") == 1, told
     assert doctor_main(["--help"]) == 0
     assert "--timeout-s" in capsys.readouterr().out
+
+
+def test_a_run_is_not_for_the_doctor(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").touch()
+    for word in (str(tmp_path), f"run={tmp_path}"):
+        with pytest.raises(ConfigError, match=f"mappo-eval run={tmp_path} tries a run"):
+            diagnose([word], print)
 
 
 @pytest.mark.parametrize(

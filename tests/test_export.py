@@ -261,7 +261,7 @@ def test_mappo_eval_plays_an_onnx_file_as_its_checkpoint(tiny_run, tmp_path, cap
     assert eval_main([f"run={elsewhere}", "env=3DBall", "episodes=2"]) == 0
     assert '"agent_steps": ' in capsys.readouterr().out
     assert eval_main([f"run={elsewhere}"]) == 2
-    assert "env=NAME (3DBall" in capsys.readouterr().err
+    assert "env=3DBall (3DBall" in capsys.readouterr().err
     assert eval_main([f"run={best}.pt", "opponent=nowhere"]) == 2
     assert "opponent=nowhere does not exist: give random, a run folder" in capsys.readouterr().err
 

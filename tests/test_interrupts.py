@@ -2,11 +2,13 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
 
-from mappo_unity.interrupts import interrupts_wait
+from mappo_unity.interrupts import interrupts_end, interrupts_wait
 
 
 def test_an_interrupt_comes_after_the_block():
@@ -43,3 +45,23 @@ def test_an_error_of_the_block_is_not_hidden_and_other_threads_do_nothing():
     thread.start()
     thread.join()
     assert ran == [1]
+
+
+def test_an_interrupt_before_anything_is_begun_ends_with_one_line():
+    code = (
+        "import os, signal, time\n"
+        "from mappo_unity.interrupts import interrupts_end\n"
+        "print('printed', end='')\n"
+        "with interrupts_end('mappo-eval'):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(60)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    assert done.returncode == 130
+    assert (done.stdout, done.stderr) == ("printed", "mappo-eval: interrupted\n")
+
+
+def test_after_the_block_interrupts_are_what_they_were():
+    with interrupts_end("mappo-eval"):
+        pass
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

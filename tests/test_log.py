@@ -163,6 +163,10 @@ def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         log.log(row(1))
         monkeypatch.setattr(MetricsFile, "append", fail)
         monkeypatch.setattr(MetricsFile, "close", fail)
+        with pytest.raises(ConfigError, match=r"No space left on device\), and there is no checkpoint yet"):
+            log.log(row(2))
+        (tmp_path / "checkpoints").mkdir()
+        (tmp_path / "checkpoints" / "step_000000000001.pt").touch()
         with pytest.raises(ConfigError, match=r"No space left on device.*continue with resume="):
             log.log(row(2))
 

@@ -112,7 +112,7 @@ def test_a_window_shows_frames_at_their_time() -> None:
         (["env=Basic", "caption=perhaps"], "caption=perhaps does not fit: caption must be true or false"),
         (["env=Basic", "caption="], "caption= does not fit: caption must be true or false"),
         (["env=Basic", "video=film.avi"], "must end in one of"),
-        (["env=custom", "video=film.mp4"], "env.factory is not given"),
+        (["env=custom", "video=film.mp4"], "env=custom needs options of an environment of your own"),
         (["env=Nope", "video=film.mp4"], "env=Nope does not exist"),
         (["run=nowhere", "video=film.mp4"], "run=nowhere does not exist"),
         (["env=Basic", "policy=none.onnx", "video=film.gif"], "policy=none.onnx does not exist"),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,8 @@ from mappo_unity.cli import player_main
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.protocol import decode, encode, messages
 from mappo_unity.protocol.batch_encoding import varint_columns
-from mappo_unity.protocol.serve import Player, env_function, main, play
+from mappo_unity.protocol.player_log import PlayerLog
+from mappo_unity.protocol.serve import Player, env_function, main, play, serve
 from mappo_unity.scenes import make_scene, scene_names
 
 from mlagents_envs.base_env import (  # isort: skip  # mappo_unity lets it import
@@ -345,7 +348,25 @@ class TestCommand:
         [
             (["Nowhere"], "there is no scene 'Nowhere'; choices: 3DBall"),
             (["3DBall", "--param", "mass=heavy"], "NAME=NUMBER"),
-            (["3DBall", "--mlagents-port", "many"], "invalid int value: 'many'"),
+            (["3DBall", "--mlagents-port", "many"], "--mlagents-port: 'many' is not a whole number"),
+            (
+                ["3DBall", "--mlagents-prt", "5005"],
+                "--mlagents-prt is not an option of mappo-player (did you",
+            ),
+            (
+                ["3DBall", "--mlagents-port", "5005", "--mlagents-port", "5006"],
+                "is given twice, 5005 and 5006",
+            ),
+            (["3DBall", "Basic"], "'Basic' behind the scene '3DBall' is no option: one scene is served"),
+            (["3DBall", "mass=2"], "parameters are given as --param mass=2"),
+            (["3dball"], "there is no scene '3dball' (did you mean 3DBall?); choices"),
+            (["os:gotcwd"], "os has no function 'gotcwd' (did you mean getcwd"),
+            (["3DBall", "-logFile", "/dev/full"], "-logFile /dev/full cannot be written: No space left on"),
+            (
+                ["build", "3DBall", "never", "--mlagents-port", "7"],
+                "--mlagents-port 7 has no effect on a build",
+            ),
+            (["build", "3DBall", "never", "more"], "build takes a scene and a folder, not more"),
             (
                 ["3DBall", "--mlagents-port", "70000"],
                 "--mlagents-port 70000 is out of range: it must be from 1 to",
@@ -360,7 +381,7 @@ class TestCommand:
         ],
     )
     def test_mistakes_are_named(self, arguments: list[str], words: str) -> None:
-        with pytest.raises(ConfigError, match=words.replace("(", r"\(")):
+        with pytest.raises(ConfigError, match=re.escape(words)):
             main(arguments)
 
     @pytest.mark.parametrize(
@@ -422,5 +443,37 @@ class TestCommand:
 
     def test_a_folder_that_cannot_be_written_is_named(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
-        with pytest.raises(ConfigError, match="cannot be written"):
+        with pytest.raises(ConfigError, match="cannot be written: .*file is a file, not a folder"):
             main(["build", "3DBall", str(tmp_path / "file" / "deeper")])
+
+    def test_arguments_of_unity_players_are_let_through(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("mappo_unity.protocol.serve.serve", lambda player, port, log: port)
+        assert main(["3DBall", "-nographics", "-batchmode", "--mlagents-port", "7", "--level", "3"]) == 7
+
+    def test_a_player_says_that_it_waits_and_what_to_type(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("mappo_unity.protocol.serve.QUIET_S", 0.05)
+        monkeypatch.setattr("mappo_unity.protocol.serve.CONNECT_TIMEOUT_S", 0.2)
+        with socket.socket() as other:  # nobody listens on its port
+            other.bind(("127.0.0.1", 0))
+            port = other.getsockname()[1]
+            lines: list[str] = []
+            assert serve(Player(env_function("Basic"), "Basic", lines.append), port, lines.append) == 1
+            waits, gives_up = lines
+            assert f"waiting up to 0.2 s for a trainer on port {port} of this machine" in waits
+            assert waits.endswith(f"mappo-train env=Basic env.backend=editor env.port={port}")
+            assert f"no trainer listened on port {port}" in gives_up
+
+            other.listen()
+            lines.clear()
+            assert serve(Player(env_function("Basic"), "a:Game", lines.append), port, lines.append) == 1
+            assert "mappo-train env=unity env.name=Game env.backend=editor" in lines[0]
+            assert f"what listens on port {port} of this machine did not answer as an ML-Agents" in lines[1]
+
+    def test_a_log_on_a_disk_that_fills_up_ends_no_play(self, tmp_path: Path) -> None:
+        log = PlayerLog(str(tmp_path / "log"))
+        log("first")
+        log._file.close()
+        log._file = open("/dev/full", "wb", buffering=0)
+        log("lost")
+        log._file.close()
+        assert (tmp_path / "log").read_text().endswith(" first\n")

@@ -7,10 +7,11 @@ ended but most of whose updates were rolled back, 130 and 143 ended by SIGINT an
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,12 @@ from mappo_unity.config.schema import (
     ExportConfig,
     PlayConfig,
 )
-from mappo_unity.interrupts import interrupts_wait
+from mappo_unity.interrupts import interrupts_end, interrupts_wait
 
 _MOST_ROLLED_BACK = 4
 _SIGNALS = {2: "SIGINT", 15: "SIGTERM"}
+_NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""What a file system refuses for reasons of its own."""
 
 
 def train_main(arguments: list[str] | None = None) -> int:
@@ -64,16 +67,20 @@ def _run_command(
     lines = sys.argv[1:] if arguments is None else arguments
     try:
         if any(line in ("--help", "-h") for line in lines):
-            print(help_text(), flush=True)
-            return 0
-        if "--version" in lines:
+            print(help_text())
+            code = 0
+        elif "--version" in lines:
             from mappo_unity import __version__
 
             print(f"{name} {__version__}")
-            return 0
-        return command(lines)
+            code = 0
+        else:
+            code = command(lines)
+        if sys.stdout is not None:  # closed by `>&-`
+            sys.stdout.flush()
+        return code
     except BrokenPipeError:  # the reader of our output has gone, as in `mappo-eval ... | head -1`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 141
     except ConfigError as error:
         print(f"{name}: {error}", *error.details, sep="\n", file=sys.stderr)
@@ -84,6 +91,18 @@ def _run_command(
     except KeyboardInterrupt as error:
         print(f"{name}: interrupted", file=sys.stderr)
         return 128 + int(getattr(error, "signal", 2))
+    except OSError as error:  # what nobody below knew the option of
+        if error.errno not in _NOT_OURS:
+            raise
+        _drop_output()
+        print(f"{name}: {error.filename or 'its output'}: {error.strerror}", file=sys.stderr)
+        return 2
+
+
+def _drop_output() -> None:
+    """Let what is still to be written to standard output go nowhere, also when Python ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _train_help() -> str:
@@ -111,13 +130,13 @@ def _export_help() -> str:
 
 
 def _player_help() -> str:
-    from mappo_unity.protocol.serve import help_text
+    from mappo_unity.protocol.player_options import help_text
 
     return help_text()
 
 
 def _player_command(lines: list[str]) -> int:
-    with interrupts_wait():
+    with interrupts_end("mappo-player"):
         from mappo_unity.protocol.serve import main
 
     return main(lines)
@@ -130,7 +149,7 @@ def _doctor_help() -> str:
 
 
 def _doctor_command(lines: list[str]) -> int:
-    with interrupts_wait():
+    with interrupts_end("mappo-doctor"):
         from mappo_unity.cli.doctor import diagnose
 
     return diagnose(lines, print)
@@ -149,13 +168,14 @@ def _train_command(lines: list[str]) -> int:
 
 def _train_anew(lines: list[str]) -> int:
     with interrupts_wait():
-        from mappo_unity.config.compose import check_effect, check_factory, compose_config
+        from mappo_unity.cli.first_checks import check_environment
+        from mappo_unity.config.compose import check_effect, compose_config
         from mappo_unity.config.overrides import given
         from mappo_unity.runs import folder as runs
 
         composed = compose_config(lines)
         check_effect(lines, [composed.config])
-        check_factory(composed.config)
+        check_environment(composed.config)
     folder = runs.create_folder(composed.run_dir, exact=given(lines, "hydra.run.dir") is not None)
     try:
         with _locked(folder.path):
@@ -168,12 +188,15 @@ def _train_anew(lines: list[str]) -> int:
 
 def _train_on(lines: list[str], path: Path) -> int:
     with interrupts_wait():
-        from mappo_unity.config.compose import check_factory, compose_resumed
+        from mappo_unity.cli.first_checks import check_environment
+        from mappo_unity.config.compose import compose_resumed
+        from mappo_unity.policies.policy_files import check_resumable
         from mappo_unity.runs import folder as runs
 
+        check_resumable(path, "resume")
         folder = runs.find_run(path, "resume")
         config = compose_resumed(lines, folder / runs.CONFIG)
-        check_factory(config)
+        check_environment(config)
     with _locked(folder):
         return _train_locked(config, folder, path if path.is_file() else folder, lines)
 
@@ -250,12 +273,14 @@ def _sweep(lines: list[str]) -> int:
 
 
 def _eval_command(lines: list[str]) -> int:
-    with interrupts_wait():
-        from mappo_unity.config.compose import check_factory, compose_plain, config_to_play
+    with interrupts_end("mappo-eval"):
+        from mappo_unity.cli.first_checks import check_evaluation
+        from mappo_unity.config.compose import compose_plain
 
-        options = vars(compose_plain(lines, EvalConfig))
+        config = compose_plain(lines, EvalConfig)
+        check_evaluation(config)
+        options = vars(config)
         run = Path(options.pop("run"))
-        check_factory(config_to_play(run, options["env"]))
         from mappo_unity.policies.evaluate import evaluate
 
     result: dict[str, Any] = evaluate(run, **options)
@@ -267,11 +292,14 @@ def _eval_command(lines: list[str]) -> int:
 
 
 def _play_command(lines: list[str]) -> int:
-    with interrupts_wait():
-        from mappo_unity.config.compose import check_factory, compose_plain, config_to_play
+    with interrupts_end("mappo-play"):
+        from mappo_unity.cli.first_checks import check_film
+        from mappo_unity.config.compose import compose_plain
+        from mappo_unity.policies.screens import check_screen
 
         options = compose_plain(lines, PlayConfig)
-        check_factory(config_to_play(Path(options.run or ""), options.env))
+        check_screen(options)
+        check_film(options)
         from mappo_unity.cli.report import play_line
         from mappo_unity.policies.film import play
 
@@ -280,17 +308,16 @@ def _play_command(lines: list[str]) -> int:
 
 
 def _export_command(lines: list[str]) -> int:
-    from mappo_unity.config.compose import compose_plain
-    from mappo_unity.runs.folder import find_run
+    with interrupts_end("mappo-export"):
+        from mappo_unity.cli.first_checks import check_export
+        from mappo_unity.config.compose import compose_plain
+        from mappo_unity.policies.policy_files import choose_checkpoint
 
-    options = compose_plain(lines, ExportConfig)
-    run = Path(options.run)
-    find_run(run, "run")
-    with interrupts_wait():
-        from mappo_unity.policies.evaluate import choose_checkpoint
+        options = compose_plain(lines, ExportConfig)
+        check_export(options)
         from mappo_unity.policies.export import export_checkpoint
 
-    checkpoint = choose_checkpoint(run)
+    checkpoint = choose_checkpoint(Path(options.run))
     for file in export_checkpoint(checkpoint, Path(options.out) if options.out else None):
         print(
             f"{file.path}: {file.policy} after {file.agent_steps:,} agent steps; plays as {checkpoint} does "

@@ -20,4 +20,4 @@ def check_range(name: str, value: int, low: int, high: int | None = None) -> Non
 def check_duration(name: str, value_s: float) -> None:
     """Raise ConfigError if a number of seconds is not a finite one above 0."""
     if not 0 < value_s < math.inf:
-        raise ConfigError(f"{name} {value_s:g} is out of range: it must be > 0")
+        raise ConfigError(f"{name} {value_s:g} is out of range: it must be > 0 and finite")

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from mappo_unity.training.trainer import Outcome
 
 RESULTS = "results.csv"
+_LABELS = {"interrupted": "ended by the time limit", "stderr": "standard error of the mean"}
+"""What the table calls figures whose names in the JSON line say too little."""
+_SHARES = ("interrupted", "won_of_decided", "won_of_decided_low95", "won_of_decided_high95")
+"""Figures that are shares from 0 to 1, and percentages in the table."""
 _PIPE_WIDTH = 160  # columns of a table that nobody's terminal limits
 
 
@@ -103,7 +107,9 @@ def eval_table(result: dict[str, Any]) -> Table:
     table.add_column("figure")
     table.add_column("value", justify="right")
     for name, value in _flat(result):
-        table.add_row(name.replace("_", " "), show_number(value))
+        above, dot, last = name.rpartition(".")
+        label = _LABELS.get(last, last.replace("_", " "))
+        table.add_row(above + dot + label, _percent(value) if last in _SHARES else show_number(value))
     return table
 
 
@@ -131,6 +137,10 @@ def show_number(value: Any) -> str:
     return (
         f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.1f}"
     )
+
+
+def _percent(share: float) -> str:
+    return "-" if share != share else f"{100 * share:.3g} %"
 
 
 def _short(text: str) -> str:

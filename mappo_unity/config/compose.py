@@ -29,6 +29,7 @@ from mappo_unity.config.overrides import (
     open_line,
     parse,
 )
+from mappo_unity.config.plain_options import check_form
 from mappo_unity.config.presets import conf_dir, group_choices
 from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.runs.folder import CONFIG, factory_folder, find_run
@@ -173,6 +174,7 @@ def to_config(tree: DictConfig) -> Config:
 
 def compose_plain(lines: list[str], schema: type) -> Any:
     """Build a dataclass without presets (mappo-eval) from its defaults and overrides; raise ConfigError."""
+    check_form(lines, schema)
     check_overrides(lines, schema, {})
     tree = OmegaConf.structured(schema)
     for override in parse(lines):

@@ -506,7 +506,8 @@ def _not_empty(**options: Optional[str]) -> None:
 
 def _rule(option: str, value: float | None, holds: bool, rule: str) -> None:
     if value is not None and not (math.isfinite(value) and holds):
-        raise ConfigError(f"{option}={value} is out of range: {option} {rule}")
+        finite = "" if math.isfinite(value) or "finite" in rule else " and be finite"
+        raise ConfigError(f"{option}={value} is out of range: {option} {rule}{finite}")
 
 
 def _at_least(option: str, value: float | None, low: float) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from traceback import TracebackException
 from typing import Any
 
+from mappo_unity.config.option_table import did_you_mean
 from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
 from mappo_unity.protocol.protobuf import install
 
@@ -215,8 +216,11 @@ def load_factory(path: str, name: str) -> Callable[..., Any]:
     function = getattr(module, function_name, None)
     if not callable(function):
         names = sorted(n for n, v in vars(module).items() if callable(v) and not n.startswith("_"))
+        hint = did_you_mean(function_name, names)
+        more = ", ..." if len(names) > 20 else ""
         raise ConfigError(
-            f"{name}: {module_name} has no function {function_name!r}; it has {', '.join(names) or 'none'}"
+            f"{name}: {module_name} has no function {function_name!r}{hint}; it has "
+            f"{', '.join(names[:20]) or 'none'}{more}"
         )
     return function
 

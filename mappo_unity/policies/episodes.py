@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.config.schema import EnvironmentFailure
 from mappo_unity.envs.contract import MAX_SILENT_STEPS, check_specs, note_silence, silence_error
 from mappo_unity.envs.record_check import RecordCheck
 from mappo_unity.envs.rounds import Episode
@@ -34,7 +34,7 @@ def play(
 
     Raises:
         EnvironmentDataError: the environment sent what breaks its contract, or nobody asks any more.
-        ConfigError: the episodes are too many to wait for.
+        EnvironmentFailure: so many episodes do not end.
     """
     running: dict[tuple[str, int], list[float]] = {}
     counts = _Counts(episodes)
@@ -64,9 +64,9 @@ def play(
             raise silence_error(silent)
         env.step()
     ended = {name: len(counts.ended.get(name, [])) for name in env.behavior_specs}
-    raise ConfigError(
-        f"episodes={episodes}: so many did not end within {MAX_ENV_STEPS:,} environment steps; ended: "
-        f"{ended}; do its episodes end, by a goal or a time limit (terminal steps)?"
+    raise EnvironmentFailure(
+        f"episodes={episodes}: so many did not end within {MAX_ENV_STEPS:,} environment steps, only {ended}; "
+        "does anything end an agent's episode (EndEpisode, a time limit)?"
     )
 
 

@@ -11,13 +11,12 @@ from typing import Any
 import torch
 
 from mappo_unity.config.compose import config_to_play
-from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.episodes import play, summarize
 from mappo_unity.policies.matches import Score, play_matches
-from mappo_unity.policies.onnx_policy import SUFFIX, OnnxFolder, OnnxPolicy
+from mappo_unity.policies.onnx_policy import OnnxFolder, OnnxPolicy
 from mappo_unity.policies.policy import CheckpointPolicy, Policy, RandomPolicy
-from mappo_unity.runs import checkpoint
+from mappo_unity.policies.policy_files import Kind, choose_checkpoint, locate
 
 
 def evaluate(
@@ -79,29 +78,11 @@ def open_policy(where: str, deterministic: bool, seed: int, option: str = "run")
     Raises:
         ConfigError: nothing is there (named by ``option``), or nothing that plays.
     """
-    if where == "random":
+    source = locate(where, option)
+    if source.kind is Kind.random:
         return RandomPolicy(seed)
-    if not Path(where).exists():
-        raise ConfigError(
-            f"{option}={where} does not exist: give random, a run folder, a checkpoint or an ONNX file"
-        )
-    if where.endswith(SUFFIX):
-        return OnnxPolicy(Path(where), deterministic, seed)
-    if list(Path(where).glob(f"*{SUFFIX}")) and not list(Path(where).glob("*.pt")):
-        return OnnxFolder(Path(where), deterministic, seed)
-    return CheckpointPolicy(choose_checkpoint(Path(where), option, f"*{SUFFIX}"), deterministic)
-
-
-def choose_checkpoint(run: Path, option: str = "run", *also: str) -> Path:
-    """Return a checkpoint file as it is; of a run folder the best, else the newest good one.
-
-    Raises:
-        ConfigError: the folder holds none; names the option, and what else was looked for in it (``also``).
-    """
-    best = run / checkpoint.FOLDER / checkpoint.BEST
-    if run.is_dir() and best.is_file():
-        return best
-    if run.is_dir() and not checkpoint.checkpoints_in(run):
-        wanted = (f"{checkpoint.FOLDER}/{checkpoint.BEST}", f"{checkpoint.FOLDER}/step_*.pt", *also)
-        raise ConfigError(f"{option}={run} holds no policy: that folder has none of {', '.join(wanted)}")
-    return checkpoint.newest_good(run)[0]
+    if source.kind is Kind.onnx:
+        return OnnxPolicy(source.path, deterministic, seed)
+    if source.kind is Kind.onnx_folder:
+        return OnnxFolder(source.path, deterministic, seed)
+    return CheckpointPolicy(choose_checkpoint(source.path, option), deterministic)

@@ -18,8 +18,10 @@ import torch
 from tensordict import TensorDictBase
 
 from mappo_unity import keys
+from mappo_unity.config.packages import ExportError
+from mappo_unity.interrupts import interrupts_wait
 from mappo_unity.policies.onnx_check import compare
-from mappo_unity.policies.onnx_graph import ExportError, build_model
+from mappo_unity.policies.onnx_graph import build_model
 from mappo_unity.policies.onnx_policy import SUFFIX, file_name
 from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.runs import checkpoint
@@ -71,8 +73,9 @@ def export_checkpoint(path: Path, out: Path | None = None) -> list[Exported]:
             )
         error = compare(data, actor, layout["sensors"], sample)
         written.append((data, Exported(name, paths[name], policy.agent_steps, rows, error)))
-    for data, exported in written:
-        _write(exported.path, data)
+    with interrupts_wait():  # all of them, or none
+        for data, exported in written:
+            _write(exported.path, data)
     return [exported for _, exported in written]
 
 
@@ -164,4 +167,7 @@ def _write(path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, data)
     except OSError as error:
-        raise ExportError(f"the ONNX file {path} cannot be written: {error.strerror or error}") from error
+        raise ExportError(
+            f"the ONNX file {path} cannot be written: {error.strerror or error}; out=... names another file "
+            "or folder"
+        ) from error

@@ -12,8 +12,9 @@ from typing import Any, Protocol
 
 import torch
 
+from mappo_unity.cli.first_checks import check_embedded
 from mappo_unity.config.compose import config_to_play
-from mappo_unity.config.schema import Backend, ConfigError, PlayConfig
+from mappo_unity.config.schema import PlayConfig
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.camera import MovingCamera
 from mappo_unity.policies.caption import Tally
@@ -73,10 +74,7 @@ def play(cfg: PlayConfig) -> dict[str, Any]:
 def open_scene(cfg: PlayConfig) -> Scene:
     """Open one area of the scene that a run was trained in, or that `cfg.env` names."""
     options = config_to_play(Path(cfg.run or ""), cfg.env).env
-    if options.backend is not Backend.embedded:
-        raise ConfigError(
-            f"mappo-play shows embedded scenes, but this environment has env.backend={options.backend.value}"
-        )
+    check_embedded(options)
     scene = make_env_function(replace(options, num_areas=1))(cfg.seed)
     assert isinstance(scene, Scene)
     return scene

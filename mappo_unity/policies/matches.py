@@ -10,17 +10,15 @@ groups) is positive at its end has won, one with a negative one has lost; anythi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from mlagents_envs.base_env import BaseEnv
 
-from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.backends import MakeEnv
 from mappo_unity.envs.rounds import Episode
-from mappo_unity.keys import team_id
 from mappo_unity.policies.episodes import play
+from mappo_unity.policies.layouts import check_two_sides
 from mappo_unity.policies.policy import Policy
 
 Z95 = 1.959964  # two-sided 95 % quantile of the standard normal distribution
@@ -97,21 +95,7 @@ def find_sides(env: BaseEnv) -> dict[int, list[str]]:
         ConfigError: there are not two sides.
     """
     env.reset()
-    sides = sides_of(env.behavior_specs)
-    if len(sides) != 2:
-        raise ConfigError(
-            f"opponent=...: matches need an environment with two sides (team ids); this one has "
-            f"{len(sides)}: {', '.join(env.behavior_specs)}"
-        )
-    return dict(sorted(sides.items()))
-
-
-def sides_of(behaviors: Iterable[str]) -> dict[int, list[str]]:
-    """Return the behaviors of each side by its team id; matches need two sides."""
-    sides: dict[int, list[str]] = {}
-    for name in behaviors:
-        sides.setdefault(team_id(name), []).append(name)
-    return sides
+    return check_two_sides(env.behavior_specs)
 
 
 def play_side(env: BaseEnv, policies: dict[str, Policy], own: list[str], matches: int) -> Score:

@@ -15,8 +15,8 @@ import torch
 from tensordict import TensorDict
 
 from mappo_unity import keys
+from mappo_unity.config.packages import ExportError
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionDistribution
-from mappo_unity.policies.onnx_graph import ExportError
 from mappo_unity.policies.onnx_policy import fit_image, open_session
 
 TOLERANCE = 1e-5  # of deterministic actions, and of the log-probability of the branch taken

@@ -16,7 +16,6 @@ checkpoints and files.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,7 +23,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from mappo_unity import __version__
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.config.packages import ExportError, import_package
 from mappo_unity.learning.actor_critic import LOG_STD_RANGE, Actor, PerMember
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import OBS_CLIP, Encoder
@@ -33,10 +32,6 @@ FORMAT = 3.0  # ML-Agents' ModelApiVersion.MLAgents2_0: an input for each sensor
 OPSET, IR_VERSION = 9, 4  # those of the files that ML-Agents writes
 FORBIDDEN = 1e8  # what ML-Agents takes off the logit of a forbidden action
 BATCH = "batch"
-
-
-class ExportError(ConfigError):
-    """A policy cannot be exported; the message says which part of it, or what is missing."""
 
 
 def build_model(
@@ -79,21 +74,6 @@ def build_model(
     onnx.helper.set_model_props(model, {"behavior_name": name, **(metadata or {})})
     onnx.checker.check_model(model, full_check=True)
     return model
-
-
-def import_package(name: str) -> Any:
-    """Return the package onnx or onnxruntime.
-
-    Raises:
-        ExportError: it is not installed; names the extra that brings it.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ExportError(
-            f"the package {name} is needed for ONNX files, but cannot be imported ({error}): "
-            "pip install 'mappo-unity[export]'"
-        ) from error
 
 
 class _Graph:

@@ -18,10 +18,9 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps
 
 from mappo_unity import keys
+from mappo_unity.config.packages import import_package
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.policies.onnx_graph import import_package
-
-SUFFIX = ".onnx"
+from mappo_unity.policies.policy_files import SUFFIX
 
 
 class OnnxPolicy:

@@ -20,6 +20,7 @@ from mappo_unity.config.schema import Activation, ConfigError, CriticKind, Model
 from mappo_unity.learning.actor_critic import make_actor
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.policies.layouts import check_layout
 from mappo_unity.runs import checkpoint
 
 
@@ -101,14 +102,7 @@ class ActorPolicy:
 
     def check(self, behavior: str, spec: BehaviorSpec) -> None:
         """Raise ConfigError if this policy cannot play that behavior."""
-        name = keys.policy_name(behavior)
-        known = self.layout.get(name)
-        found = describe_spec(spec, known["team_size"] if known else 1)
-        if known != found:
-            raise ConfigError(
-                f"{self.name} cannot play {behavior!r}: it was trained for {self.layout}, "
-                f"but the environment has {found}"
-            )
+        check_layout(self.name, self.layout, behavior, spec)
 
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
         """Remember nothing."""
@@ -177,16 +171,6 @@ def _spread(rows: np.ndarray, places: Places) -> torch.Tensor:
     out = fill((*places.shape, *rows.shape[1:]), rows.dtype)
     out[places.teams, places.members] = rows
     return torch.from_numpy(out)
-
-
-def describe_spec(spec: BehaviorSpec, team_size: int) -> dict[str, Any]:
-    """Return what a network must fit: sensor shapes, actions, team size."""
-    return {
-        "team_size": team_size,
-        "sensors": [list(o.shape) for o in spec.observation_specs],
-        "continuous": int(spec.action_spec.continuous_size),
-        "branches": [int(n) for n in spec.action_spec.discrete_branches],
-    }
 
 
 def _actor(state: dict[str, Any], name: str) -> Any:

@@ -163,15 +163,23 @@ def _put(geom: Any, shape: Shape) -> None:
     geom.specular, geom.shininess = 0.2, 0.4
 
 
+def check_opengl() -> None:
+    """Raise ConfigError if nothing can be drawn offscreen here (names the packages)."""
+    _offscreen_context(64, 64).free()
+
+
 def _offscreen_context(width: int, height: int) -> Any:
     """Return a GL context without a window: what MUJOCO_GL names, else EGL, else OSMesa."""
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip() or _installed()
+    if wanted not in ("egl", "osmesa"):
+        wanted = "glfw"  # the only one left, whatever name MuJoCo takes it by
     try:
         if wanted == "egl":
             from mujoco.egl import GLContext
         elif wanted == "osmesa":
             from mujoco.osmesa import GLContext
         else:
+            _start_glfw()
             from mujoco.glfw import GLContext
         return GLContext(width, height)
     except Exception as error:  # PyOpenGL and the drivers raise many kinds
@@ -180,6 +188,14 @@ def _offscreen_context(width: int, height: int) -> Any:
             f"({error or type(error).__name__}); install what is missing: {PACKAGES}; the environment "
             "variable MUJOCO_GL chooses between egl, osmesa and glfw"
         ) from error
+
+
+def _start_glfw() -> None:
+    import glfw
+
+    glfw.ERROR_REPORTING = "ignore"  # no warnings beside our message
+    if not glfw.init():
+        raise RuntimeError("it needs a display")
 
 
 def _installed() -> str:

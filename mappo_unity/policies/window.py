@@ -18,6 +18,19 @@ from mappo_unity.config.schema import ConfigError
 from mappo_unity.policies.render import Stage
 from mappo_unity.scenes.core.shapes import Camera, Shape
 
+NO_WINDOW = "no window can be opened on the display; video=FILE.mp4 or .gif writes a video"
+
+
+def check_display() -> None:
+    """Start the library of windows; raise ConfigError if there is no display, or none that it can use."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ConfigError("there is no display for a window here; video=FILE.mp4 or .gif writes a video")
+    import glfw
+
+    glfw.ERROR_REPORTING = "ignore"  # no warnings beside our message
+    if not glfw.init():
+        raise ConfigError(NO_WINDOW)
+
 
 class Window:
     """Show shapes in a window; a context manager.
@@ -33,19 +46,15 @@ class Window:
     """
 
     def __init__(self, camera: Camera, size: tuple[int, int], fps: float, title: str) -> None:
-        if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise ConfigError("there is no display for a window here; video=FILE.mp4 or .gif writes a video")
+        check_display()
         import glfw
 
-        glfw.ERROR_REPORTING = "ignore"  # no warnings beside our message
         self._glfw: Any = glfw
-        self._window: Any = None
-        if glfw.init():
-            glfw.window_hint(glfw.SAMPLES, 4)
-            self._window = glfw.create_window(*size, title, None, None)
+        glfw.window_hint(glfw.SAMPLES, 4)
+        self._window: Any = glfw.create_window(*size, title, None, None)
         if not self._window:
             glfw.terminate()
-            raise ConfigError("no window can be opened on the display; video=FILE.mp4 or .gif writes a video")
+            raise ConfigError(NO_WINDOW)
         glfw.make_context_current(self._window)
         self._stage = Stage(camera, *size)
         self._context = mujoco.MjrContext(self._stage.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)

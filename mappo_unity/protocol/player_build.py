@@ -21,7 +21,7 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
         ConfigError: no such scene, a folder that cannot be written, or a platform without scripts.
     """
     if rest:
-        raise ConfigError(f"mappo-player build: unknown arguments {' '.join(rest)}")
+        raise ConfigError(f"build takes a scene and a folder, not {' '.join(rest)}")
     name = scene.rpartition(":")[2] or scene
     path = _executable(Path(folder), name)
     command = [sys.executable, "-m", "mappo_unity.protocol.serve", scene]
@@ -31,6 +31,9 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
         command += ["--param", parameter]
     if options.no_png:
         command += ["--no-png"]
+    file = next((above for above in path.parents if above.exists() and not above.is_dir()), None)
+    if file is not None:
+        raise ConfigError(f"{path} cannot be written: {file} is a file, not a folder")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f'#!/bin/sh\nexec {shlex.join(command)} "$@"\n', encoding="utf-8")

@@ -9,6 +9,7 @@ systems a player leaves when its connection breaks.
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -33,27 +34,81 @@ except OSError as error:
 LAST_LINES, LAST_BYTES, LINE_LENGTH = 3, 4096, 200
 """How much of what a failed player printed is quoted: lines, read from the last bytes; characters a line."""
 
+_PROGRAMS = {
+    b"\x7fELF": "Linux",
+    b"MZ": "Windows",
+    b"\xcf\xfa\xed\xfe": "macOS",
+    b"\xca\xfe\xba\xbe": "macOS",
+}
+"""How programs begin, and the systems that they are built for."""
+
 
 def find_executable(file_name: str, option: str = "env.file_name") -> Path:
     """Return the executable that `file_name` (with or without its extension) means on this system.
 
     Raises:
-        ConfigError: there is none, or it may not be executed; says what was looked for.
+        ConfigError: there is none, it may not be executed, or this system cannot run it; says what is there.
     """
     from mlagents_envs.env_utils import validate_environment_path
 
-    found = validate_environment_path(os.path.expanduser(file_name))
-    if found is None or not Path(found).is_file():
+    if not file_name.strip():
+        raise ConfigError(f"{option}= is empty: give the path of the built player")
+    path = Path(os.path.expanduser(file_name))
+    _check_link(path, f"{option}={file_name}")
+    place = validate_environment_path(str(path)) or path
+    if not Path(place).is_file():
         kinds = {"darwin": ".app", "win32": ".exe"}.get(sys.platform, ".x86_64, .x86, or no extension")
         raise ConfigError(
-            f"{option}={file_name}: no Unity player is there; looked for {Path(file_name).absolute()} with "
-            f"{kinds}; give the path of the built player{_beside(Path(file_name))}"
+            f"{option}={file_name}: no Unity player is there; looked for {path.absolute()} with "
+            f"{kinds}; give the path of the built player{_inside(path) or _beside(path)}"
         )
+    found = Path(place).absolute()
     if not os.access(found, os.X_OK):
         raise ConfigError(
             f"{option}={file_name}: {found} is not executable; run: chmod +x {shell_word(found)}"
         )
-    return Path(found).absolute()
+    reason = _why_not_run(found)
+    if reason is not None:
+        raise ConfigError(f"{option}={file_name}: {found} cannot be run on this system: {reason}")
+    return found
+
+
+def _check_link(path: Path, what: str) -> None:
+    """Raise ConfigError if a path cannot be followed; one that does not exist may lack its extension."""
+    try:
+        path.stat()
+    except FileNotFoundError as error:
+        if path.is_symlink():
+            target = os.readlink(path)
+            raise ConfigError(f"{what} is a symbolic link to {target}, which does not exist") from error
+    except NotADirectoryError:
+        pass  # nothing is there, which is told with what lies beside it
+    except OSError as error:
+        circle = "it is a symbolic link that leads in a circle"
+        reason = circle if error.errno == errno.ELOOP else error.strerror
+        raise ConfigError(f"{what} cannot be opened: {reason}") from error
+
+
+def _why_not_run(path: Path) -> str | None:
+    """Say why a file is no program for this system, as far as its beginning tells; None if it may be one."""
+    if os.name == "nt":
+        return None
+    with path.open("rb") as file:
+        begin = file.read(256)
+    if not begin:
+        return "it is empty; build or copy the player again"
+    if begin.startswith(b"#!"):
+        interpreter = begin[2:].split(b"\n")[0].decode(errors="replace").strip(" \t")
+        if os.path.exists(interpreter.split(" ")[0]):
+            return None
+        return f"it is a script for {interpreter!r}, which is not there"
+    for magic, system in _PROGRAMS.items():
+        if begin.startswith(magic):
+            home = {"Linux": "linux", "macOS": "darwin"}.get(system, "win32")
+            return None if sys.platform == home else f"it is built for {system}; build one for this system"
+    if b"\0" in begin:
+        return None  # perhaps a format that was registered here
+    return "it is a text without a first line such as #!/bin/sh; give the player itself"
 
 
 class PlayerProcess:
@@ -144,10 +199,20 @@ def _end_of(path: Path) -> str:
     return " | ".join([line for line in lines if line][-LAST_LINES:])
 
 
+def _inside(path: Path) -> str:
+    """Say that a path is a folder, and which players it holds; "" if it is none."""
+    if not path.is_dir():
+        return ""
+    names = [entry.name for entry in path.glob("*") if entry.suffix in (".x86_64", ".x86", ".app", ".exe")]
+    return f" ({path} is a folder; players in it: {', '.join(sorted(names)) or 'none'})"
+
+
 def _beside(path: Path) -> str:
     """Name what lies in the folder of a path that does not exist."""
     folder = path.absolute().parent
     if not folder.is_dir():
         return f" (there is no folder {folder})"
+    if not os.access(folder, os.R_OK | os.X_OK):
+        return f" (the folder {folder} may not be read)"
     names = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
     return f" ({folder} holds {', '.join(names[:10]) or 'nothing'}{', ...' if len(names) > 10 else ''})"

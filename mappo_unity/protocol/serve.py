@@ -7,33 +7,36 @@ or goes away. Order of messages: RpcCommunicator.cs of com.unity.ml-agents. Must
 
 from __future__ import annotations
 
-import argparse
+import re
+import socket
 import sys
-import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TextIO
+from typing import Any
 
-from mappo_unity.cli.arguments import check_range
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.protocol.protobuf import install
 
 install()
 
 import grpc  # noqa: E402
-import numpy as np  # noqa: E402
 from mlagents_envs.base_env import BaseEnv  # noqa: E402
 
 from mappo_unity import __version__  # noqa: E402
+from mappo_unity.config.option_table import did_you_mean  # noqa: E402
 from mappo_unity.protocol import encode, messages, side_channels  # noqa: E402
 from mappo_unity.protocol.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
 from mappo_unity.protocol.player_build import build  # noqa: E402
+from mappo_unity.protocol.player_log import PlayerLog  # noqa: E402
+from mappo_unity.protocol.player_options import EDITOR_PORT, check_build, parse  # noqa: E402
 
-EDITOR_PORT = 5004
-"""Port on which a trainer waits for the Editor, used when no --mlagents-port is given."""
 CONNECT_TIMEOUT_S = 60.0
 """How long a player looks for its trainer."""
+RETRIES = (("grpc.initial_reconnect_backoff_ms", 500), ("grpc.max_reconnect_backoff_ms", 1000))
+"""How often it looks: gRPC's own pauses grow so long that it may miss a trainer."""
+QUIET_S = 1.0
+"""After so much of it the player says that it waits: a trainer that starts players listens already."""
 
 MakeEnv = Callable[[int, "int | None"], BaseEnv]
 Log = Callable[[str], None]
@@ -49,35 +52,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Raises:
         ConfigError: a mistake in the options.
     """
-    options = _parser().parse_known_args(arguments)
-    known, ignored = options
-    check_range("--mlagents-port", known.port, 1, 65535)
-    if known.num_areas is not None:
-        check_range("--num-areas", known.num_areas, 1)
-    params = dict(map(_parameter, known.param))
+    known, ignored = parse(sys.argv[1:] if arguments is None else arguments)
     if known.scene == "build":
-        if len(ignored) < 2:
-            raise ConfigError(
-                "mappo-player build needs a scene and a folder: mappo-player build 3DBall builds"
-            )
-        env_function(ignored[0], known.num_areas, params)(0, None).close()  # it starts with these options
+        check_build(known, ignored)
+        env_function(ignored[0], known.num_areas, known.params)(
+            0, None
+        ).close()  # it starts with these options
         print(build(ignored[0], ignored[1], ignored[2:], known))
         return 0
-    make_env = env_function(known.scene, known.num_areas, params)
-    with _open_log(known.log_file) as file:
-
-        def log(line: str) -> None:
-            print(f"{time.strftime('%H:%M:%S')} {line}", file=file, flush=True)
-
-        log(f"mappo-player {__version__}: {known.scene}, port {known.port}, protocol {messages.API_VERSION}")
+    make_env = env_function(known.scene, known.num_areas, known.params)
+    port = EDITOR_PORT if known.port is None else known.port
+    with PlayerLog(known.log_file) as log:
+        log(f"mappo-player {__version__}: {known.scene}, port {port}, protocol {messages.API_VERSION}")
         if ignored:
             log(f"accepted and without effect: {' '.join(ignored)}")
-        return serve(Player(make_env, known.scene, log, png=not known.no_png), known.port, log)
-
-
-def help_text() -> str:
-    """Return what mappo-player --help prints."""
-    return _parser().format_help()
+        return serve(Player(make_env, known.scene, log, png=not known.no_png), port, log)
 
 
 def env_function(scene: str, num_areas: int | None = None, params: dict[str, float] | None = None) -> MakeEnv:
@@ -89,7 +78,7 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
     fixed: dict[str, Any] = dict(params or {}) | ({} if num_areas is None else {"num_areas": num_areas})
     if "seed" in fixed:
         raise ConfigError("--param seed: the seed is the trainer's to choose")
-    if ":" in scene:
+    if re.fullmatch(r"[\w.]+:\w+", scene):
         from mappo_unity.envs.backends import call_factory, check_call, load_factory
 
         factory = load_factory(scene, scene)
@@ -98,8 +87,10 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
     from mappo_unity.scenes import make_scene, scene_names
 
     if scene not in scene_names():
+        hint = did_you_mean(scene, scene_names())
+        choices = ", ".join(scene_names())
         raise ConfigError(
-            f"there is no scene {scene!r}; choices: {', '.join(scene_names())}, or package.module:function"
+            f"there is no scene {scene!r}{hint}; choices: {choices}, or package.module:function"
         )
     make_scene(scene, **{"num_areas": 1} | fixed).close()  # refuses what it does not take
     return lambda seed, areas: make_scene(
@@ -109,16 +100,47 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
 
 def serve(player: Player, port: int, log: Log) -> int:
     """Connect to the trainer on a port of this machine and play until it closes; return the exit code."""
-    channel = grpc.insecure_channel(f"localhost:{port}", options=messages.OPTIONS)
-    try:
-        grpc.channel_ready_future(channel).result(timeout=CONNECT_TIMEOUT_S)
-    except grpc.FutureTimeoutError:
-        log(f"no trainer listens on port {port} of this machine")
+    channel = grpc.insecure_channel(f"localhost:{port}", options=(*messages.OPTIONS, *RETRIES))
+    if not _connect(channel, player.scene, port, log):
+        channel.close()
         return 1
     try:
         return play(player, channel.unary_unary(messages.METHOD), log)
     finally:
         channel.close()
+
+
+def _connect(channel: grpc.Channel, scene: str, port: int, log: Log) -> bool:
+    """Wait for the trainer, and say so if that takes a while; tell whether it came."""
+    ready = grpc.channel_ready_future(channel)
+    try:
+        ready.result(timeout=QUIET_S)
+        return True
+    except grpc.FutureTimeoutError:
+        log(
+            f"waiting up to {CONNECT_TIMEOUT_S:g} s for a trainer on port {port} of this machine "
+            f"(localhost); start one in another terminal, for example: {_trainer(scene, port)}"
+        )
+    try:
+        ready.result(timeout=CONNECT_TIMEOUT_S - QUIET_S)
+        return True
+    except grpc.FutureTimeoutError:
+        log(f"{_who_listens(port)} within {CONNECT_TIMEOUT_S:g} s; --mlagents-port N looks on another port")
+        return False
+
+
+def _trainer(scene: str, port: int) -> str:
+    """Return the command that trains on this player."""
+    env = f"env={scene}" if ":" not in scene else f"env=unity env.name={scene.rpartition(':')[2]}"
+    return f"mappo-train {env} env.backend=editor" + (f" env.port={port}" if port != EDITOR_PORT else "")
+
+
+def _who_listens(port: int) -> str:
+    try:
+        socket.create_connection(("localhost", port), timeout=1).close()
+    except OSError:
+        return f"no trainer listened on port {port} of this machine"
+    return f"what listens on port {port} of this machine did not answer as an ML-Agents trainer does"
 
 
 def play(player: Player, exchange: Callable[..., bytes], log: Log) -> int:
@@ -128,7 +150,7 @@ def play(player: Player, exchange: Callable[..., bytes], log: Log) -> int:
         log("the trainer closed")
         return 0
     except grpc.RpcError as error:
-        log(f"the connection to the trainer is gone: {error.code()}")
+        log(f"the connection to the trainer is gone: {error.details() or error.code()}")
         return 1
     except ConfigError as mistake:
         log("\n".join([str(mistake), *mistake.details]))
@@ -247,48 +269,6 @@ def _say_goodbye(exchange: Callable[..., bytes], text: str) -> None:
         exchange(messages.message(STATUS_QUIT, text=text), timeout=5)
     except grpc.RpcError:
         pass  # nobody is there to hear it
-
-
-def _open_log(path: str | None) -> TextIO:
-    if path is None or path == "-":
-        return open(sys.stdout.fileno(), "w", closefd=False, encoding="utf-8")
-    try:
-        return open(path, "w", encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"-logFile {path} cannot be written: {error.strerror}") from error
-
-
-def _parameter(text: str) -> tuple[str, float]:
-    name, _, value = text.partition("=")
-    try:
-        number = float(value)
-    except ValueError:
-        number = np.nan
-    if not name or not np.isfinite(number):
-        raise ConfigError(f"--param {text} is not of the form NAME=NUMBER")
-    return name, int(number) if number.is_integer() else number  # num_threads and others want whole ones
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> Any:
-        raise ConfigError(f"{message}; {self.format_usage().strip()}")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="mappo-player",
-        usage="mappo-player SCENE [--mlagents-port N] [options]   |   mappo-player build SCENE DIR [options]",
-        description="Serve a scene as a Unity player, to a trainer that listens on a port of this machine. "
-        "Other arguments of Unity players (-nographics, -batchmode ...) are accepted and have no effect.",
-        allow_abbrev=False,
-    )
-    parser.add_argument("scene", metavar="SCENE", help="a scene's name, or package.module:function")
-    parser.add_argument("--mlagents-port", dest="port", type=int, default=EDITOR_PORT, metavar="N")
-    parser.add_argument("-logFile", "-logfile", dest="log_file", metavar="PATH", help="log; default stdout")
-    parser.add_argument("--num-areas", type=int, metavar="N", help="areas, whatever the trainer asks for")
-    parser.add_argument("--param", action="append", default=[], metavar="NAME=NUMBER")
-    parser.add_argument("--no-png", action="store_true", help="send pictures as floats")
-    return parser
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ import grpc
 
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.protocol.messages import METHOD, OPTIONS, STATUS_QUIT, message
+from mappo_unity.protocol.ports import ADDRESS, check_port
 
-ADDRESS = "127.0.0.1"
 POLL_S = 0.1  # how often the player's process is looked at while nothing comes
 GRACE_S = 1.0  # for the goodbye to reach the player: without it gRPC may cut the call that carries it
 
@@ -38,6 +38,7 @@ class Link:
     """
 
     def __init__(self, port: int = 0) -> None:
+        check_port(port, "env.port")
         self._requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._peer: str | None = None
@@ -47,13 +48,8 @@ class Link:
         self._server.add_generic_rpc_handlers((_Handler(self._exchange),))
         try:
             self.port = self._server.add_insecure_port(f"{ADDRESS}:{port}")
-        except RuntimeError:
-            self.port = 0
-        if not self.port:
-            raise ConfigError(
-                f"port {port} of {ADDRESS} is in use: another training, or a game started by hand, holds it; "
-                "end that one, or choose another port (env.port) on both sides"
-            )
+        except RuntimeError as error:
+            raise ConfigError(f"port {port} of {ADDRESS} cannot be listened on: {error}") from error
         self._server.start()
 
     def receive(self, timeout_s: float, check: Callable[[], None] = lambda: None) -> bytes:

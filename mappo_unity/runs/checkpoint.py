@@ -12,26 +12,26 @@ from __future__ import annotations
 
 import io
 import os
-import re
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from mappo_unity.config.schema import ConfigError
 from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.checkpoint_file import (
+    BEST,
+    FOLDER,
+    FORMAT,
+    NAME,
+    CheckpointError,
+    checkpoints_in,
+    newest_good,
+    read_plain,
+    unreadable,
+)
 
-FORMAT = 2
-FOLDER = "checkpoints"
-BEST = "best.pt"
-_NAME = "step_{:012d}.pt"
-_PATTERN = re.compile(r"step_(\d{12})\.pt")
-
-
-class CheckpointError(ConfigError):
-    """A checkpoint cannot be written, read or used; the message says which and why."""
+__all__ = ["BEST", "FOLDER", "CheckpointError", "checkpoints_in", "load", "newest_good", "save", "save_in"]
 
 
 def save(path: Path, state: dict[str, Any]) -> None:
@@ -61,7 +61,7 @@ def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, be
             f"the run folder {folder} was removed or moved while the run was training: "
             f"no checkpoint of {agent_steps} steps can be written"
         )
-    path = folder / FOLDER / _NAME.format(agent_steps)
+    path = folder / FOLDER / NAME.format(agent_steps)
     save(path, state)
     if best:
         link = path.with_name(f".{BEST}.{os.getpid()}.tmp")
@@ -77,67 +77,17 @@ def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, be
     return path
 
 
-def checkpoints_in(folder: Path) -> list[Path]:
-    """Return a run's numbered checkpoints, oldest first."""
-    return sorted(p for p in (folder / FOLDER).glob("step_*.pt") if _PATTERN.fullmatch(p.name))
-
-
 def load(path: Path) -> dict[str, Any]:
     """Read a checkpoint.
 
     Raises:
         CheckpointError: it is missing, damaged, not ours, or holds more than tensors and plain values.
     """
-    if not path.is_file():
-        raise CheckpointError(f"checkpoint {path} does not exist")
+    read_plain(path)  # says what is wrong with it
     try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise CheckpointError(
-                f"checkpoint {path} is damaged: the checksum of its part {damaged!r} is wrong"
-            )
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except CheckpointError:
-        raise
-    except Exception as error:  # zipfile, pickle and torch raise many kinds for damaged or hostile files
-        reason = str(error).strip().split("\n")[0][:200] or type(error).__name__
-        raise CheckpointError(
-            f"checkpoint {path} is damaged or no checkpoint of mappo-unity: {reason}"
-        ) from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
-        found = state.get("format") if isinstance(state, dict) else None
-        raise CheckpointError(f"checkpoint {path} has format {found}, but this version reads format {FORMAT}")
-    return state
-
-
-def newest_good(where: Path) -> tuple[Path, list[str]]:
-    """Return the checkpoint to continue from: the file itself, or a folder's newest good one.
-
-    Returns:
-        The path, and a line for each damaged file that was passed over.
-
-    Raises:
-        CheckpointError: there is none.
-    """
-    if where.is_file():
-        candidates, folder = [where], where.parent.parent
-        candidates += [p for p in reversed(checkpoints_in(folder)) if p.name < where.name]
-    elif where.is_dir():
-        candidates = list(reversed(checkpoints_in(where)))
-    else:
-        raise CheckpointError(f"{where} does not exist: give a run folder or a checkpoint file")
-    if not candidates:
-        raise CheckpointError(f"{where} holds no checkpoint ({FOLDER}/step_*.pt): nothing to continue from")
-    warnings: list[str] = []
-    for path in candidates:
-        try:
-            load(path)
-        except CheckpointError as error:
-            warnings.append(str(error))
-        else:
-            return path, warnings
-    raise CheckpointError(f"{where} holds no good checkpoint:\n  " + "\n  ".join(warnings))
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for damaged or hostile files
+        raise CheckpointError(unreadable(path, error)) from error
 
 
 def _to_tensors(value: Any) -> Any:

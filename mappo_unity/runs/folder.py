@@ -6,8 +6,10 @@ In: paths, a `Config`, override lines. Out: a folder with config.yaml (every opt
 
 from __future__ import annotations
 
+import errno
 import importlib.metadata
 import json
+import os
 import platform
 import shutil
 import subprocess
@@ -131,20 +133,56 @@ def find_run(path: Path, option: str) -> Path:
 
     Raises ConfigError, naming the option, where there is none.
     """
-    if not path.exists():
+    check_there(path, option)
+    whole = Path(os.path.abspath(path))  # the path may be given from inside a run's folder
+    levels = 1 if path.is_dir() else 3  # of a run's folder only that of its checkpoints is as good as itself
+    above = [*path.parents][:levels] + [*whole.parents][:levels]
+    for folder in [path, *above]:
+        if (folder / CONFIG).is_file():
+            return folder
+    if path.is_file():
+        raise ConfigError(
+            f"{option}={path} lies in no run folder: there is no {CONFIG} beside it or above, which says how "
+            f"the run was trained{runs_below(path.parent)}"
+        )
+    raise ConfigError(
+        f"{option}={path} is neither a run folder nor a checkpoint in one: no {CONFIG} there"
+        f"{runs_below(path)}"
+    )
+
+
+def runs_below(folder: Path, count: int = 5) -> str:
+    """Return "; newest runs below ..." with the newest runs in a folder, or an empty text."""
+    if not folder.is_dir() or folder.resolve() == folder.resolve().parent:  # nobody keeps runs in /
+        return ""
+    found: list[Path] = []
+    for pattern in ("*", "*/*", "*/*/*", "*/*/*/*"):
+        found += [path.parent for path in folder.glob(f"{pattern}/{CONFIG}")]
+    found = [path for path in found if (path / VERSIONS).is_file()]
+    newest = sorted(found, key=lambda path: (path / CONFIG).stat().st_mtime, reverse=True)[:count]
+    return f"; newest runs below {folder}: {', '.join(map(str, newest))}" if newest else ""
+
+
+def check_there(path: Path, option: str, wanted: str = "") -> None:
+    """Raise ConfigError if nothing is at a path that an option names, or it cannot be looked at.
+
+    `wanted` is added to "does not exist", before the runs near it.
+    """
+    try:
+        path.stat()
+    except FileNotFoundError as error:
+        if path.is_symlink():
+            raise ConfigError(
+                f"{option}={path} is a symbolic link to {os.readlink(path)}, which does not exist"
+            ) from error
         near = path.parent
         while not near.exists():
             near = near.parent
-        raise ConfigError(f"{option}={path} does not exist{_runs_in(near)}")
-    folders = [path] if path.is_dir() else list(path.parents)[:3]
-    for folder in folders:
-        if (folder / CONFIG).is_file():
-            return folder
-    if path.is_dir() and (path.parent / CONFIG).is_file():  # the checkpoints' own folder
-        return path.parent
-    raise ConfigError(
-        f"{option}={path} is neither a run folder nor a checkpoint in one: no {CONFIG} there{_runs_in(path)}"
-    )
+        raise ConfigError(f"{option}={path} does not exist{wanted}{runs_below(near)}") from error
+    except OSError as error:
+        circle = "it is a symbolic link that leads in a circle"
+        reason = circle if error.errno == errno.ELOOP else error.strerror
+        raise ConfigError(f"{option}={path} cannot be opened: {reason}") from error
 
 
 def factory_folder(folder: Path) -> Path | None:
@@ -207,17 +245,6 @@ def _other_files(folder: Path) -> dict[Path, tuple[int, int]]:
 
 def _state_of(files: Iterable[Path]) -> dict[Path, tuple[int, int]]:
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
-
-
-def _runs_in(folder: Path, count: int = 5) -> str:
-    if not folder.is_dir():
-        return ""
-    found: list[Path] = []
-    for pattern in ("*", "*/*", "*/*/*", "*/*/*/*"):
-        found += [path.parent for path in folder.glob(f"{pattern}/{CONFIG}")]
-    found = [path for path in found if (path / VERSIONS).is_file()]
-    newest = sorted(found, key=lambda path: (path / CONFIG).stat().st_mtime, reverse=True)[:count]
-    return f"; newest runs below {folder}: {', '.join(map(str, newest))}" if newest else ""
 
 
 def _git_state(checkout: Path) -> dict[str, Any]:

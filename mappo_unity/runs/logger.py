@@ -108,9 +108,12 @@ class RunLog:
             return (
                 f"the run folder {self._folder} was removed or moved while the run was training: it ends here"
             )
+        what = f"the metrics in {self._folder} cannot be written ({error.strerror or error})"
+        if not any((self._folder / "checkpoints").glob("*.pt")):
+            return f"{what}, and there is no checkpoint yet to continue from: free some space and start again"
         return (
-            f"the metrics in {self._folder} cannot be written ({error.strerror or error}); the checkpoints "
-            f"there stay as they are. Free some space, then continue with resume={self._folder}"
+            f"{what}; the checkpoints there stay as they are. Free some space, then continue with "
+            f"resume={self._folder}"
         )
 
     def message(self, text: str) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.interrupts import interrupts_wait
+from mappo_unity.policies.screens import check_mujoco
 
 if TYPE_CHECKING:
     from mlagents_envs.base_env import BaseEnv
@@ -45,5 +46,9 @@ def make_scene(name: str, seed: int = 0, **params: Any) -> BaseEnv:
         raise ConfigError(f"there is no embedded scene {name!r}; choices: {', '.join(SCENES)}")
     module_name, _, scene = SCENES[name].partition(":")
     with interrupts_wait():
-        module = importlib.import_module(f"{__name__}.{module_name}")
+        try:
+            module = importlib.import_module(f"{__name__}.{module_name}")
+        except Exception:
+            check_mujoco()  # says it if that is why
+            raise
     return getattr(module, scene)(seed=seed, **params)

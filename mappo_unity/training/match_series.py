@@ -14,7 +14,8 @@ import torch
 from mappo_unity.config.schema import Config, ConfigError
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.learning.actor_critic import UnityActor
-from mappo_unity.policies.matches import Score, play_matches, sides_of
+from mappo_unity.policies.layouts import sides_of
+from mappo_unity.policies.matches import Score, play_matches
 from mappo_unity.policies.policy import ActorPolicy, RandomPolicy
 from mappo_unity.runs.folder import PLAYERS
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from mappo_unity.config.schema import ModelConfig
 from mappo_unity.envs.unity_env import UnityEnv
-from mappo_unity.policies.policy import describe_spec
+from mappo_unity.policies.layouts import describe_spec
 from mappo_unity.runs.checkpoint import CheckpointError
 
 

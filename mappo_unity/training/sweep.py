@@ -23,6 +23,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
+from mappo_unity.cli.first_checks import check_environment
 from mappo_unity.config.behavior_lines import dotted_options, readable_lines
 from mappo_unity.config.compose import Composed, check_effect, check_factory, compose_config, to_config
 from mappo_unity.config.overrides import check_overrides, given, open_line, parse, quoted
@@ -110,7 +111,7 @@ def plan_jobs(lines: list[str]) -> list[list[str]]:
         jobs = [list(job) for job in BasicSweeper.split_arguments(parse(task), None)[0]]
     configs = [_compose_job(job, hydra).config for job in jobs]
     for config in configs:
-        check_factory(config)
+        check_environment(config)
     if not is_search(lines) or not _sweeps_backend(task):
         check_effect([line for job in jobs for line in job], configs)
     return jobs

@@ -1,0 +1,30 @@
+"""Packages that are imported where they are needed, and what to say where one is missing.
+
+In: a package's name. Out: the package, or an `ExportError` that names the extra.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from mappo_unity.config.schema import ConfigError
+
+
+class ExportError(ConfigError):
+    """A policy cannot be exported; the message says which part of it, or what is missing."""
+
+
+def import_package(name: str) -> Any:
+    """Return the package onnx or onnxruntime.
+
+    Raises:
+        ExportError: it is not installed; names the extra that brings it.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ExportError(
+            f"the package {name} is needed for ONNX files, but cannot be imported ({error}): "
+            "pip install 'mappo-unity[export]'"
+        ) from error

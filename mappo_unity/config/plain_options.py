@@ -1,0 +1,64 @@
+"""What people write who do not know option=value yet: switches, words alone, an option twice.
+
+In: the arguments of a command without presets (mappo-eval, mappo-play, mappo-export) and its dataclass. Out:
+nothing, or a `ConfigError` that says how it is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mappo_unity.config.option_table import Option, did_you_mean, option_table
+from mappo_unity.config.overrides import parse, shell_word
+from mappo_unity.config.schema import ConfigError
+
+
+def check_form(lines: Sequence[str], schema: type) -> None:
+    """Raise ConfigError for arguments that are not of the form option=value, or that give an option twice."""
+    table = option_table(schema)
+    seen: dict[str, str] = {}
+    for number, line in enumerate(lines):
+        key = line.partition("=")[0]
+        if line.startswith("-"):
+            raise ConfigError(_switch(lines, number, table))
+        if "=" not in line:
+            raise ConfigError(_word(lines, number, table))
+        if key in seen:
+            raise ConfigError(f"{key} is given twice, {seen[key]} and {line}: give it once")
+        seen[key] = line
+    for override, line in zip(parse(list(lines)), lines):
+        if override.is_sweep_override():
+            raise ConfigError(
+                f"{line}: {override.key_or_group} takes one value; a text with a comma stands in quotes "
+                f"inside quotes, {override.key_or_group}='\"like, this\"'"
+            )
+
+
+def _switch(lines: Sequence[str], number: int, table: dict[str, Option]) -> str:
+    """Say how a switch (--run=x, --run x) is written here."""
+    key, equals, value = lines[number].partition("=")
+    name = key.lstrip("-").replace("-", "_")
+    rule = "options are written option=value, and the only switches are --help and --version"
+    if name not in table:
+        return f"{key} is not an option{did_you_mean(name, table)}: {rule}"
+    following = [value] if equals else lines[number + 1 : number + 2]
+    return f"{key} is written {name}={_value(following, table[name])}: {rule}"
+
+
+def _word(lines: Sequence[str], number: int, table: dict[str, Option]) -> str:
+    """Say what a word alone may have been meant for: an option's name, or a value."""
+    word = lines[number]
+    rest = [line.removeprefix("=") for line in lines[number + 1 : number + 3] if line != "="]
+    if word in table:
+        value = _value(rest, table[word])
+        return f"{word} has no value: it is written {word}={value}, without spaces"
+    hint = did_you_mean(word, table) or f" (did you mean {next(iter(table))}={shell_word(word)}?)"
+    return f"{word!r} is not of the form option=value{hint}; options: {', '.join(table)}"
+
+
+def _value(following: Sequence[str], option: Option) -> str:
+    """Return what may have been meant as an option's value: the next word, if it is one."""
+    if option.type is bool:
+        return "true"
+    alone = [word for word in following[:1] if word and "=" not in word and not word.startswith("-")]
+    return shell_word(alone[0]) if alone else "VALUE"

@@ -1,0 +1,78 @@
+"""What a policy was built for beside what an environment's behaviors are, and the sides that behaviors have.
+
+In: layouts of a checkpoint, behaviors and their specs. Out: nothing, or a `ConfigError` in the user's words.
+Imports no torch: what does not fit can be told before anything heavy is loaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from mappo_unity import keys
+from mappo_unity.config.schema import ConfigError
+from mappo_unity.protocol.protobuf import install
+
+install()
+
+from mlagents_envs.base_env import BehaviorSpec  # noqa: E402
+
+
+def describe_spec(spec: BehaviorSpec, team_size: int) -> dict[str, Any]:
+    """Return what a network must fit: sensor shapes, actions, team size."""
+    return {
+        "team_size": team_size,
+        "sensors": [list(o.shape) for o in spec.observation_specs],
+        "continuous": int(spec.action_spec.continuous_size),
+        "branches": [int(n) for n in spec.action_spec.discrete_branches],
+    }
+
+
+def check_layout(owner: str, layout: Mapping[str, Any], behavior: str, spec: BehaviorSpec) -> None:
+    """Raise ConfigError if policies of that layout (by policy name) cannot play a behavior.
+
+    `owner`: what holds them, for the message.
+    """
+    name = keys.policy_name(behavior)
+    if name not in layout:
+        raise ConfigError(
+            f"{owner} cannot play {behavior!r}: it holds {_names(layout)}, trained for another environment"
+        )
+    found = describe_spec(spec, layout[name]["team_size"])
+    if layout[name] != found:
+        raise ConfigError(
+            f"{owner} cannot play {behavior!r}: it was trained with {_words(layout[name])}, but the "
+            f"environment has {_words(found)}"
+        )
+
+
+def sides_of(behaviors: Iterable[str]) -> dict[int, list[str]]:
+    """Return the behaviors of each side by its team id; matches need two sides."""
+    sides: dict[int, list[str]] = {}
+    for name in behaviors:
+        sides.setdefault(keys.team_id(name), []).append(name)
+    return sides
+
+
+def check_two_sides(behaviors: Iterable[str]) -> dict[int, list[str]]:
+    """Return the behaviors of each of two sides; raise ConfigError if there are not two."""
+    names = list(behaviors)
+    sides = sides_of(names)
+    if len(sides) != 2:
+        raise ConfigError(
+            "opponent=... plays matches, which need an environment with two sides (team ids); this one has "
+            f"{len(sides)}: {', '.join(names)}. Leave opponent out to play episodes"
+        )
+    return dict(sorted(sides.items()))
+
+
+def _names(layout: Mapping[str, Any]) -> str:
+    names = ", ".join(map(repr, layout))
+    return f"the policy {names}" if len(layout) == 1 else f"the policies {names or 'of nobody'}"
+
+
+def _words(layout: Mapping[str, Any]) -> str:
+    sensors = " and ".join(str(shape) for shape in layout["sensors"]) or "nothing"
+    actions = [f"{layout['continuous']} continuous"] if layout["continuous"] else []
+    actions += [f"discrete {layout['branches']}"] if layout["branches"] else []
+    return f"observations {sensors} and actions {' and '.join(actions) or 'of no kind'}"

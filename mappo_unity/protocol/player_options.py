@@ -1,0 +1,100 @@
+"""The command line of mappo-player: its own switches among the arguments that Unity players take.
+
+In: arguments. Out: values and what has no effect, or a `ConfigError`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+
+from mappo_unity.cli.arguments import check_range
+from mappo_unity.cli.switches import Once, Parser, whole_number
+from mappo_unity.config.schema import ConfigError
+
+EDITOR_PORT = 5004
+"""Port on which a trainer waits for the Editor, used when no --mlagents-port is given."""
+
+
+def parse(lines: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Return the values (`params` by name), and the arguments that have no effect here.
+
+    Raises:
+        ConfigError: a mistake, or a switch that is nearly one of ours.
+    """
+    parser = _parser()
+    known, ignored = parser.parse_known_args(lines)
+    _check_ignored(parser, lines, known.scene, ignored)
+    if known.port is not None:
+        check_range("--mlagents-port", known.port, 1, 65535)
+    if known.num_areas is not None:
+        check_range("--num-areas", known.num_areas, 1)
+    known.params = dict(map(_parameter, known.param))
+    return known, ignored
+
+
+def check_build(known: argparse.Namespace, words: Sequence[str]) -> None:
+    """Raise ConfigError if the arguments of mappo-player build are not a scene and a folder."""
+    if len(words) < 2:
+        raise ConfigError("build needs a scene and a folder: mappo-player build 3DBall builds")
+    for option, given in (("--mlagents-port", known.port), ("-logFile", known.log_file)):
+        if given is not None:
+            raise ConfigError(f"{option} {given} has no effect on a build: its trainer gives it")
+
+
+def help_text() -> str:
+    """Return what mappo-player --help prints."""
+    return _parser().format_help()
+
+
+def _parameter(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not name or not math.isfinite(number):
+        raise ConfigError(f"--param {text} is not of the form NAME=NUMBER")
+    return name, int(number) if number.is_integer() else number  # num_threads and others want whole ones
+
+
+def _check_ignored(parser: Parser, lines: Sequence[str], scene: str, ignored: Sequence[str]) -> None:
+    """Refuse what was meant for us; other arguments of Unity players have no effect here."""
+    second = lines[1] if len(lines) > 1 and lines[0] == scene != "build" else "-"
+    if not second.startswith("-"):
+        form = f"; parameters are given as --param {second}" if "=" in second else ": one scene is served"
+        raise ConfigError(f"{second!r} behind the scene {scene!r} is no option{form}")
+    for word in ignored:
+        if word.startswith("--") and parser.near(word):
+            raise ConfigError(f"{word} is not an option of mappo-player{parser.near(word)}")
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        prog="mappo-player",
+        usage="mappo-player SCENE [--mlagents-port N] [options]   |   mappo-player build SCENE DIR [options]",
+        description="Serve a scene as a Unity player, to a trainer that listens on a port of this machine. "
+        "Other arguments of Unity players (-nographics, -batchmode ...) are accepted and have no effect.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("scene", metavar="SCENE", help="a scene's name, or package.module:function")
+    parser.add_argument(
+        "--mlagents-port",
+        dest="port",
+        type=whole_number,
+        action=Once,
+        metavar="N",
+        help=f"port of this machine on which the trainer listens; default {EDITOR_PORT}",
+    )
+    parser.add_argument("-logFile", "-logfile", dest="log_file", metavar="PATH", help="log; default stdout")
+    parser.add_argument(
+        "--num-areas",
+        type=whole_number,
+        action=Once,
+        metavar="N",
+        help="areas, whatever the trainer asks for",
+    )
+    parser.add_argument("--param", action="append", default=[], metavar="NAME=NUMBER")
+    parser.add_argument("--no-png", action="store_true", help="send pictures as floats")
+    return parser

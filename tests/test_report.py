@@ -1,0 +1,39 @@
+"""What an evaluation's table says for people, and its JSON line for programs."""
+
+from __future__ import annotations
+
+import io
+import json
+
+from rich.console import Console
+
+from mappo_unity.cli.report import eval_table, json_line
+
+RESULT = {
+    "policy": "best.pt",
+    "behaviors": {
+        "Small?team=0": {"episodes": 8, "stderr": 0.25, "interrupted": 0.625},
+        "Big?team=0": {"episodes": 8, "stderr": 0.5, "interrupted": 1.0},
+    },
+}
+
+
+def printed(result: dict) -> str:
+    text = io.StringIO()
+    Console(file=text, width=120).print(eval_table(result))
+    return text.getvalue()
+
+
+def test_a_share_is_no_count() -> None:
+    text = printed(RESULT)
+    rows = [" ".join(line.strip("│┃ ").split()) for line in text.splitlines()]
+    assert "behaviors.Small?team=0.ended by the time limit │ 62.5 %" in rows
+    assert "behaviors.Big?team=0.ended by the time limit │ 100 %" in rows
+    assert "behaviors.Big?team=0.standard error of the mean │ 0.5" in rows
+    assert "interrupted" not in text
+    matches = printed({"won_of_decided": 0.5, "won_of_decided_low95": float("nan")})
+    assert "50 %" in matches and "-" in matches
+
+
+def test_programs_read_the_same_names_as_before() -> None:
+    assert json.loads(json_line(RESULT))["behaviors"]["Big?team=0"]["interrupted"] == 1.0
