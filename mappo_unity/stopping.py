@@ -65,6 +65,11 @@ def _hand_on(number: int) -> None:
 _sweep: Patience | None = None  # in the process of the sweep; None in those of its jobs
 
 
+def in_process_of_its_own() -> bool:
+    """Return whether a job runs in a process of its own, beside others."""
+    return _sweep is None
+
+
 @contextmanager
 def sweep_signals(patience: Patience, parallel: bool) -> Iterator[None]:
     """Between jobs, let SIGTERM end a sweep as Ctrl-C does: with its table and its exit code.

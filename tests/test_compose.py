@@ -19,6 +19,7 @@ from mappo_unity.config.compose import (
     compose_resumed,
     load_config,
 )
+from mappo_unity.config.extras import install_command
 from mappo_unity.config.option_table import option_table
 from mappo_unity.config.overrides import given, shell_argument
 from mappo_unity.config.per_behavior import behavior_config
@@ -155,7 +156,12 @@ def test_run_folder_is_named_by_env_and_by_the_user() -> None:
         ("log.backends=[csv,tb]", ["log.backends=[csv,tb]", "any of csv, tensorboard, wandb, mlflow"]),
         ("env.params=3", ["env.params=3", "named values"]),
         ("ppo.gamma=2", ["ppo.gamma=2", "out of range", "from 0 to 1"]),
-        ("ppo.lr=nan", ["ppo.lr=nan", "must be > 0"]),
+        ("ppo.lr=nan", ["ppo.lr=nan", "must be > 0, and finite"]),
+        ("ppo.lr=inf", ["ppo.lr=inf", "must be > 0, and finite"]),
+        ("ppo.lr=-1", ["ppo.lr=-1.0 is out of range: ppo.lr must be > 0"]),
+        ("max_steps=1e30", ["max_steps=1e+30 is out of range", "at most 9223372036854775807"]),
+        (f"max_steps={10**400}", ["is out of range", "at most 9223372036854775807"]),
+        ("model.hidden=[100000000000000000000]", ["model.hidden=[100000000000000000000] is out of range"]),
         ("stop_at_return=inf", ["stop_at_return=inf", "finite"]),
         ("model.hidden=[]", ["model.hidden=[]", "at least one width"]),
         ("seed=-1", ["seed=-1", "from 0 to 2147483647"]),
@@ -236,7 +242,7 @@ def test_an_option_without_effect_is_refused_when_a_run_goes_on(tmp_path: Path) 
     [
         ("no_such_module:f", ["no_such_module cannot be imported", "No module named"]),
         ("test_compose:make_nothin", ["has no make_nothin", "did you mean make_nothing"]),
-        ("test_compose:NOT_A_FUNCTION", ["is a int", "must be a function that returns a BaseEnv"]),
+        ("test_compose:NOT_A_FUNCTION", ["is an int", "must be a function that returns a BaseEnv"]),
     ],
 )
 def test_a_wrong_factory_is_told(factory: str, words: list[str]) -> None:
@@ -263,7 +269,7 @@ def test_a_missing_sweep_package_names_the_extra(monkeypatch: pytest.MonkeyPatch
         ("hydra/sweeper=optuna", "hydra-optuna-sweeper"),
     ):
         message = message_of([line])
-        assert package in message and "mappo-unity[sweep]" in message
+        assert package in message and install_command("sweep") in message
 
 
 def test_a_run_goes_on_with_its_own_options(tmp_path: Path) -> None:

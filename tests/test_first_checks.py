@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from mappo_unity.cli.first_checks import check_embedded, check_environment, check_film, check_out
 from mappo_unity.config.schema import Backend, Config, ConfigError, EnvConfig, PlayConfig
+from mappo_unity.policies.first_checks import check_embedded, check_environment, check_film, check_out
 from mappo_unity.policies.policy_files import (
     Kind,
     check_checkpoint,
@@ -261,7 +261,7 @@ def test_places_that_take_an_export(place: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(place)
     for out in ("new.onnx", "nothing", "new/folder", "exports.v1.2", "best.pt/", "only_onnx/3DBall.onnx"):
         check_out(out)
-    monkeypatch.setattr("mappo_unity.cli.first_checks.os.access", lambda path, mode: False)
+    monkeypatch.setattr("mappo_unity.policies.first_checks.os.access", lambda path, mode: False)
     with pytest.raises(ConfigError, match="no permission to write in the folder nothing"):
         check_out("nothing")
 

@@ -18,10 +18,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from mappo_unity.config.extras import install_command
 from mappo_unity.config.schema import ConfigError, LogBackend, LogConfig
 from mappo_unity.runs.logger import RunLog, read_metrics
 from mappo_unity.runs.metrics_csv import MetricsFile, keep_until
-from mappo_unity.runs.progress import Progress, describe
+from mappo_unity.runs.progress import Progress, describe, job_of_sweep
 
 NAN = math.nan
 TENSORBOARD = LogConfig(backends=[LogBackend.tensorboard], progress=False)
@@ -344,8 +345,9 @@ def test_events_hold_the_numbers_without_nan(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
 def test_missing_logger_names_the_extra(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda package: None)
-    with pytest.raises(ConfigError, match=rf"log\.backends has {name}.*pip install 'mappo-unity\[{name}\]'"):
+    with pytest.raises(ConfigError, match=rf"log\.backends has {name}") as caught:
         RunLog(LogConfig(backends=[LogBackend[name]]), tmp_path / "run", 1000)
+    assert install_command(name) in str(caught.value)
     assert not (tmp_path / "run").exists()
 
 
@@ -424,6 +426,28 @@ def test_without_a_terminal_lines_are_seldom_and_the_last_is_there() -> None:
     progress.close()
     progress.close()
     assert [line.split("/")[0] for line in text.getvalue().splitlines()] == ["100", "500", "900", "1,000"]
+
+
+def test_the_lines_of_a_job_name_it(tmp_path: Path) -> None:
+    console, text = plain_console()
+    with (
+        job_of_sweep(3, is_beside_others=False),
+        RunLog(LogConfig(backends=[]), tmp_path, 1000, console=console) as log,
+    ):
+        log.message("run folder: here")
+        log.log(row(1))
+    first, second = text.getvalue().splitlines()
+    assert first == "[job 3] run folder: here" and second.startswith("[job 3] 100/1,000 steps")
+
+
+def test_jobs_side_by_side_update_no_line_in_place() -> None:
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=True, width=100, _environ={"TERM": "xterm"})
+    with job_of_sweep(3, is_beside_others=True):
+        progress = Progress(console, 1000)
+    progress.update(row(1))
+    progress.close()
+    assert text.getvalue().startswith("[job 3] 100/1,000 steps") and "\x1b" not in text.getvalue()
 
 
 def test_time_left_is_reckoned_from_the_last_half_minute() -> None:

@@ -17,9 +17,10 @@ import pytest
 
 from mappo_unity import stopping
 from mappo_unity.cli import train_main
-from mappo_unity.config.compose import load_config
+from mappo_unity.config.compose import compose_config, load_config
 from mappo_unity.config.schema import ConfigError
-from mappo_unity.training.sweep import plan_jobs, run_sweep
+from mappo_unity.training.plan import plan_jobs
+from mappo_unity.training.sweep import run_sweep
 
 
 @pytest.fixture(autouse=True)
@@ -51,6 +52,7 @@ def test_a_grid_runs_every_combination_and_ranks_them(capsys: pytest.CaptureFixt
     assert [float(row["return_mean"]) for row in rows] == pytest.approx([0.9, 0.7, -0.1, -0.3])
     out = capsys.readouterr().out
     assert "best first" in out and str(folder) in out
+    assert "\n[job 2] half way\n" in out
     assert out.index("│   2 │ 1") < out.index("│   1 │ 0")
     for number in range(4):
         job = folder / str(number)
@@ -143,9 +145,80 @@ def test_a_named_sweep_folder_is_never_overwritten() -> None:
 
 
 def test_planned_jobs_are_the_combinations() -> None:
-    assert plan_jobs(["seed=range(0,3)", "ppo.epochs=2"]) == [
+    assert plan_jobs(["seed=range(0,3)", "ppo.epochs=2"]).jobs == [
         [f"seed={seed}", "ppo.epochs=2"] for seed in range(3)
     ]
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["seed=range(0,100000)"], ["100,000 jobs (100,000 of seed)", "max_jobs=1000", "max_jobs=100000"]),
+        (["seed=range(0,3)", "ppo.epochs=1,2", "max_jobs=5"], ["6 jobs (3 of seed x 2 of ppo.epochs)"]),
+        (["seed=range(0,5,0)"], ["seed=range(0,5,0)", "the range has no end"]),
+        (["seed=range(0,inf)"], ["the range has no end"]),
+        (["seed=range(5,0)"], ["seed=range(5,0) has no value", "empty"]),
+        (["seed=range(-1,5)"], ["seed=-1 is out of range"]),
+        (["seed=range(0,5,0.5)"], ["seed=0.0 does not fit", "a whole number"]),
+        (["seed=glob(*)"], ["glob chooses presets", "seed=a,b,c"]),
+        (["hydra.sweeper.max_batch_size=0", "seed=1,2"], ["max_batch_size=0 is out of range", ">= 1"]),
+        (["hydra/launcher=basic,joblib"], ["belongs to the sweep itself and has one value"]),
+    ],
+)
+def test_a_grid_that_cannot_be_run_is_refused_at_once(lines: list[str], words: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        run_sweep(lines)
+    assert not Path("outputs").exists()
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("n_trials=0", ["hydra.sweeper.n_trials=0 is out of range", ">= 1"]),
+        ("n_trials=-3", ["hydra.sweeper.n_trials=-3 is out of range", ">= 1"]),
+        ("n_jobs=0", ["hydra.sweeper.n_jobs=0 is out of range", ">= 1"]),
+        ("max_failure_rate=2", ["hydra.sweeper.max_failure_rate=2.0", "from 0 to 1"]),
+        ("direction=up", ["the sweep cannot start", "'minimize' or 'maximize'"]),
+    ],
+)
+def test_a_search_that_cannot_be_run_is_refused(line: str, words: list[str]) -> None:
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    with pytest.raises(ConfigError) as caught:
+        run_sweep(["hydra/sweeper=optuna", f"hydra.sweeper.{line}", "seed=range(0,100000)"])
+    assert not Path("outputs").exists()
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_no_processes_are_refused() -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    with pytest.raises(ConfigError, match="hydra.launcher.n_jobs=0 is out of range"):
+        run_sweep(["hydra/launcher=joblib", "hydra.launcher.n_jobs=0", "seed=0,1"])
+
+
+def test_a_long_check_is_announced_and_finds_each_jobs_own_options() -> None:
+    said: list[str] = []
+    plan = plan_jobs(["env=3DBall,Basic", "seed=range(0,60)", "ppo.epochs=1,2"], say=said.append)
+    assert said == ["checking the options of 240 jobs ..."]
+    assert len(plan.jobs) == len(plan.configs) == 240
+    for job in (0, 1, 119, 120, 239):
+        assert plan.configs[job] == compose_config(plan.jobs[job]).config
+    plan = plan_jobs(["behaviors={A: {ppo: {lr: 1}}},{}", "ppo.epochs=1,2"])
+    assert [(config.ppo.epochs, list(config.behaviors)) for config in plan.configs] == [
+        (1, ["A"]),
+        (2, ["A"]),
+        (1, []),
+        (2, []),
+    ]
+    with pytest.raises(ConfigError, match=r"seed=-1 is out of range.*\(in the job seed=-1 env.num_areas=3"):
+        plan_jobs(["seed=0,1,-1", "env.num_areas=3"])
+
+
+def test_presets_are_chosen_by_their_names() -> None:
+    jobs = plan_jobs(["recipe=glob(m*)"]).jobs
+    assert jobs == [["recipe=mappo_paper"], ["recipe=mlagents"]]
 
 
 def test_optuna_searches_for_the_best_return(capsys: pytest.CaptureFixture[str]) -> None:
@@ -262,9 +335,11 @@ def test_the_wait_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_joblib_runs_jobs_in_processes_of_their_own(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     process = start_with_fake_training(tmp_path, "hydra/launcher=joblib", "seed=0,1,13,5")
-    _, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=120)
     assert process.returncode == 1, errors
     assert "UserWarning" not in errors
+    for job in range(2):
+        assert f"[job {job}] half way beside others\n" in output
     rows = results(only_sweep())
     assert [(row["seed"], row["status"]) for row in rows] == [
         ("5", "finished"),

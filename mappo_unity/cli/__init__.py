@@ -8,6 +8,7 @@ ended but most of whose updates were rolled back, 130 and 143 ended by SIGINT an
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -65,6 +66,8 @@ def _run_command(
     name: str, command: Callable[[list[str]], int], help_text: Callable[[], str], arguments: list[str] | None
 ) -> int:
     lines = sys.argv[1:] if arguments is None else arguments
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a path in letters that a terminal lacks must end no run
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         if any(line in ("--help", "-h") for line in lines):
             print(help_text())
@@ -156,30 +159,36 @@ def _doctor_command(lines: list[str]) -> int:
 
 
 def _train_command(lines: list[str]) -> int:
+    from mappo_unity.config.options_file import take_file
     from mappo_unity.config.overrides import given
+    from mappo_unity.config.text_lines import literal_lines
 
-    if "-m" in lines or "--multirun" in lines:
-        return _sweep([line for line in lines if line not in ("-m", "--multirun")])
+    options = [line for line in lines if line not in ("-m", "--multirun")]
+    is_sweep = len(options) < len(lines)
+    lines, file = take_file(literal_lines(options, Config, is_sweep))
+    if is_sweep:
+        return _sweep(lines, file)
     resume = given(lines, "resume")
     if resume == "":
         raise ConfigError("resume= is empty: it must name a run folder or a checkpoint file")
-    return _train_anew(lines) if resume is None else _train_on(lines, Path(str(resume)))
+    return _train_anew(lines, file) if resume is None else _train_on(lines, Path(str(resume)))
 
 
-def _train_anew(lines: list[str]) -> int:
+def _train_anew(lines: list[str], file: Path | None) -> int:
     with interrupts_wait():
-        from mappo_unity.cli.first_checks import check_environment
         from mappo_unity.config.compose import check_effect, compose_config
         from mappo_unity.config.overrides import given
+        from mappo_unity.policies.first_checks import check_environment
         from mappo_unity.runs import folder as runs
 
-        composed = compose_config(lines)
+        composed = compose_config(lines, file=file)
         check_effect(lines, [composed.config])
         check_environment(composed.config)
     folder = runs.create_folder(composed.run_dir, exact=given(lines, "hydra.run.dir") is not None)
     try:
         with _locked(folder.path):
-            runs.write_record(folder.path, composed.config, lines)
+            typed = lines if file is None else [f"--config={file}", *lines]
+            runs.write_record(folder.path, composed.config, typed)
             return _train(composed.config, folder.path, None)
     except (ConfigError, KeyboardInterrupt) as error:
         runs.discard_folder(folder, error)
@@ -188,8 +197,8 @@ def _train_anew(lines: list[str]) -> int:
 
 def _train_on(lines: list[str], path: Path) -> int:
     with interrupts_wait():
-        from mappo_unity.cli.first_checks import check_environment
         from mappo_unity.config.compose import compose_resumed
+        from mappo_unity.policies.first_checks import check_environment
         from mappo_unity.policies.policy_files import check_resumable
         from mappo_unity.runs import folder as runs
 
@@ -238,7 +247,6 @@ def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
     with interrupts_wait():
         from mappo_unity.training.trainer import train
 
-    print(f"continuing from {checkpoint}" if checkpoint else f"run folder: {folder}", flush=True)
     outcome = train(config, folder, checkpoint)
     from mappo_unity.cli.report import run_summary
     from mappo_unity.config.overrides import shell_argument
@@ -255,11 +263,11 @@ def _train(config: Config, folder: Path, checkpoint: Path | None) -> int:
     return 128 + outcome.signal
 
 
-def _sweep(lines: list[str]) -> int:
+def _sweep(lines: list[str], file: Path | None) -> int:
     from mappo_unity.cli import report
     from mappo_unity.training.sweep import run_sweep
 
-    result = run_sweep(lines)
+    result = run_sweep(lines, file)
     report.write_csv(result)
     console = report.console()
     console.print(report.sweep_table(result))
@@ -274,8 +282,8 @@ def _sweep(lines: list[str]) -> int:
 
 def _eval_command(lines: list[str]) -> int:
     with interrupts_end("mappo-eval"):
-        from mappo_unity.cli.first_checks import check_evaluation
         from mappo_unity.config.compose import compose_plain
+        from mappo_unity.policies.first_checks import check_evaluation
 
         config = compose_plain(lines, EvalConfig)
         check_evaluation(config)
@@ -293,8 +301,8 @@ def _eval_command(lines: list[str]) -> int:
 
 def _play_command(lines: list[str]) -> int:
     with interrupts_end("mappo-play"):
-        from mappo_unity.cli.first_checks import check_film
         from mappo_unity.config.compose import compose_plain
+        from mappo_unity.policies.first_checks import check_film
         from mappo_unity.policies.screens import check_screen
 
         options = compose_plain(lines, PlayConfig)
@@ -309,8 +317,8 @@ def _play_command(lines: list[str]) -> int:
 
 def _export_command(lines: list[str]) -> int:
     with interrupts_end("mappo-export"):
-        from mappo_unity.cli.first_checks import check_export
         from mappo_unity.config.compose import compose_plain
+        from mappo_unity.policies.first_checks import check_export
         from mappo_unity.policies.policy_files import choose_checkpoint
 
         options = compose_plain(lines, ExportConfig)

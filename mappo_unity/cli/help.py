@@ -19,12 +19,14 @@ Usage:
   mappo-train [option=value ...]            train; the results are in outputs/<env>/<date>_<time>
   mappo-train -m [option=value,value ...]   sweep: one run for each combination
   mappo-train resume=RUN [option=value ...] continue a run folder or a checkpoint
+  mappo-train --config FILE [option=value ...]  with the options of a YAML file, such as a run's config.yaml
   mappo-train --help | --version
 
 Examples:
   mappo-train env=3DBall seed=1
   mappo-train env=custom env.factory=package.module:function env.params.size=3
   mappo-train -m env=3DBall seed=0,1,2 ppo.lr=1e-4,3e-4
+  mappo-train -m env=3DBall recipe=none,mappo_paper,benchmarl
   mappo-train -m env=3DBall hydra/sweeper=optuna hydra.sweeper.n_trials=20 hydra/launcher=joblib
   mappo-train resume=outputs/3DBall/2026-11-20_12-00-00 max_steps=2000000
 """

@@ -19,7 +19,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from mappo_unity.config import backend_options
-from mappo_unity.config.option_table import did_you_mean, option_table
+from mappo_unity.config.behavior_lines import OPEN
+from mappo_unity.config.option_table import did_you_mean, option_table, with_article
+from mappo_unity.config.options_file import file_root
 from mappo_unity.config.overrides import (
     SWEEP_EXTRA,
     check_overrides,
@@ -30,8 +32,9 @@ from mappo_unity.config.overrides import (
     parse,
 )
 from mappo_unity.config.plain_options import check_form
-from mappo_unity.config.presets import conf_dir, group_choices
+from mappo_unity.config.presets import NO_CHOICE, conf_dir, group_choices
 from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.text_lines import key_name, literal_lines, quoted
 from mappo_unity.runs.folder import CONFIG, factory_folder, find_run
 from mappo_unity.user_modules import add_working_directory, look_in
 
@@ -59,25 +62,33 @@ class Composed:
         return Path(str(OmegaConf.select(tree, "hydra.sweep.dir")))
 
 
-def compose_config(lines: list[str], base: Path | None = None) -> Composed:
+def compose_config(lines: list[str], base: Path | None = None, file: Path | None = None) -> Composed:
     """Compose and check the options of one run.
 
-    `base` is the config.yaml of a run that goes on; without it the presets are the base.
-    Raises ConfigError.
+    `base` is the config.yaml of a run that goes on; without it the presets are the base, and the options of
+    `file` go on top of them. Raises ConfigError.
     """
     check_overrides(lines, Config, group_choices())
     lines = [open_line(line) for line in lines]
-    store = register_schema()
-    name = "config"
-    if base is not None:
-        name = "resumed"
-        store.store(name=name, node=_resumed_root(base))
+    name = register_root(lines, base, file)
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
             tree = compose(name, lines, return_hydra_config=True)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error)) from error
     return Composed(to_config(tree), tree)
+
+
+def register_root(lines: list[str], base: Path | None = None, file: Path | None = None) -> str:
+    """Register what the options start from, as `compose_config` says; return its name. Raises ConfigError."""
+    store = register_schema()
+    if base is not None:
+        store.store(name="resumed", node=_resumed_root(base))
+        return "resumed"
+    if file is not None:
+        store.store(name="from_file", node=file_root(file, lines))
+        return "from_file"
+    return "config"
 
 
 def register_schema() -> ConfigStore:
@@ -145,7 +156,7 @@ def config_to_play(run: Path, env: str | None) -> Config:
     module of env.factory may also lie where the run found it.
     """
     if env is not None:
-        return compose_config([f"env={env}"]).config
+        return compose_config([f"env={quoted(env)}"]).config
     try:
         folder = find_run(run, "run")
         config = load_config(folder / CONFIG)
@@ -164,6 +175,8 @@ def to_config(tree: DictConfig) -> Config:
     tree = tree.copy()
     with open_dict(tree):
         tree.pop("hydra", None)
+        for key in OPEN:
+            _respell(tree, key)
     try:
         config = OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
@@ -175,6 +188,7 @@ def to_config(tree: DictConfig) -> Config:
 def compose_plain(lines: list[str], schema: type) -> Any:
     """Build a dataclass without presets (mappo-eval) from its defaults and overrides; raise ConfigError."""
     check_form(lines, schema)
+    lines = literal_lines(lines, schema)
     check_overrides(lines, schema, {})
     tree = OmegaConf.structured(schema)
     for override in parse(lines):
@@ -217,9 +231,9 @@ def check_factory(config: Config) -> None:
             f"callable there: {', '.join(names[:20]) or 'nothing of its own'}"
         )
     if not callable(getattr(module, name)):
-        kind = type(getattr(module, name)).__name__
+        kind = with_article(type(getattr(module, name)).__name__)
         raise ConfigError(
-            f"env.factory={factory}: {name} is a {kind}, but must be a function that returns a BaseEnv"
+            f"env.factory={factory}: {name} is {kind}, but must be a function that returns a BaseEnv"
         )
 
 
@@ -229,9 +243,29 @@ def _is_own_function(value: Any, module: str) -> bool:
 
 def _resumed_root(base: Path) -> dict[Any, Any]:
     saved = _read_options(base)
-    groups = [{group: None} for group in group_choices() if group != "env"]
+    groups = [
+        {group: NO_CHOICE if NO_CHOICE in names else None}
+        for group, names in group_choices().items()
+        if group != "env"
+    ]
+    official = {
+        "optional official": f"${{recipe}}/{saved['env'].get('name')}"
+    }  # the recipe's own for the env
     quiet = [{"override hydra/job_logging": "none"}, {"override hydra/hydra_logging": "none"}]
-    return {"defaults": ["schema", "_self_", *groups, *quiet], **saved}
+    return {"defaults": ["schema", "_self_", *groups, official, *quiet], **saved}
+
+
+def _respell(tree: DictConfig, key: str) -> None:
+    """Give the names below an open option their own letters again."""
+    names = OmegaConf.to_container(OmegaConf.select(tree, key), resolve=False)
+    if _named(names) != names:
+        OmegaConf.update(tree, key, _named(names), merge=False)
+
+
+def _named(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    return {key_name(name) if isinstance(name, str) else name: _named(item) for name, item in value.items()}
 
 
 def _read_options(path: Path) -> dict[Any, Any]:

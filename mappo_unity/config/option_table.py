@@ -34,7 +34,7 @@ class Option:
     @property
     def is_open(self) -> bool:
         """Whether the option takes names of the user's own below it (``env.params.mass``)."""
-        return get_origin(_without_none(self.type)) is dict
+        return get_origin(without_none(self.type)) is dict
 
     @property
     def wanted(self) -> str:
@@ -89,9 +89,14 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
     return f" (did you mean {' or '.join(hits)}?)" if hits else ""
 
 
+def with_article(name: str) -> str:
+    """Return ``"an int"`` for int, ``"a function"`` for function."""
+    return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
+
+
 def wanted(hint: Any) -> str:
     """Say in words which values a type takes: ``Optional[int]`` -> "a whole number or null"."""
-    inner = _without_none(hint)
+    inner = without_none(hint)
     if inner is not hint:
         return f"{wanted(inner)} or null"
     if get_origin(hint) is list:
@@ -109,7 +114,7 @@ def wanted(hint: Any) -> str:
 
 def short_type(hint: Any) -> str:
     """Return a type as the help shows it: ``Optional[list[int]]`` -> ``"[int] or null"``."""
-    inner = _without_none(hint)
+    inner = without_none(hint)
     if inner is not hint:
         return f"{short_type(inner)} or null"
     if get_origin(hint) is list:
@@ -134,7 +139,8 @@ def show_value(value: Any) -> str:
     return str(value)
 
 
-def _without_none(hint: Any) -> Any:
+def without_none(hint: Any) -> Any:
+    """Return a type without its None: ``Optional[int]`` -> ``int``."""
     if get_origin(hint) in (Union, types.UnionType):
         (inner,) = [item for item in get_args(hint) if item is not type(None)]
         return inner

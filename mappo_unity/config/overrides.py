@@ -7,6 +7,7 @@ that names the option, its value, the rule and the choices. Composes nothing.
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import re
 import shlex
@@ -16,28 +17,37 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import IntervalSweep, Override, Quote, QuotedString
+from hydra.core.override_parser.types import Glob, IntervalSweep, Override, RangeSweep
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mappo_unity.config.behavior_lines import readable_line
+from mappo_unity.config.extras import install_command
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table, show_value
+from mappo_unity.config.presets import describe_choices
 from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.text_lines import LINE, parse_or_none, quoted_path
 
 SWEEP_EXTRA = {
     "hydra/launcher=joblib": "hydra_joblib_launcher",
     "hydra/sweeper=optuna": "hydra_optuna_sweeper",
 }
 """Presets of conf/hydra that need a plugin, and the plugin's package."""
-
-_LINE = re.compile(r"(?P<prefix>\+\+|\+|~)?(?P<key>[^=+~\s]+)(?P<rest>=.*)?", re.DOTALL)
+LARGEST = 2**63 - 1
+"""The largest whole number that files and tensors hold."""
 
 
 def given(lines: list[str], key: str) -> Any:
     """Return the value that the overrides give to a key (the last one), or None."""
     values = [item.value() for item in parse(lines) if item.key_or_group == key and not item.is_delete()]
-    return values[-1] if values else None
+    return _unescaped(values[-1]) if values else None
+
+
+def _unescaped(value: Any) -> Any:
+    """Return a text without the backslashes that keep ``${`` from being an interpolation."""
+    is_escaped = isinstance(value, str) and re.search(r"\\\$\{", value)
+    return OmegaConf.create({"text": value})["text"] if is_escaped else value
 
 
 def given_options(lines: list[str]) -> list[str]:
@@ -53,7 +63,7 @@ def parse(lines: list[str]) -> list[Override]:
 def open_line(line: str) -> str:
     """Let new names below an open option do without Hydra's plus signs: ``env.params.mass=2``."""
     line = readable_line(line)
-    match = _LINE.fullmatch(line)
+    match = LINE.fullmatch(line)
     option = find_option(option_table(Config), match["key"]) if match else None
     is_new = match is not None and match["prefix"] is None and option is not None and option.is_open
     return f"++{line}" if is_new else line
@@ -69,18 +79,32 @@ def check_overrides(
     for line in lines:
         override = _parse_line(line)
         key = override.key_or_group
+        if isinstance(override.value(), Glob):
+            raise ConfigError(f"{line}: glob chooses presets (env, recipe); give {key}'s values: {key}=a,b,c")
         if override.is_sweep_override() and not sweep:
             raise ConfigError(
                 f"{line}: several values for {key} make a sweep, which needs -m "
                 f"(mappo-train -m {shell_word(line)})"
             )
         if key.startswith(("hydra.", "hydra/")) and groups:
-            _check_sweep_extra(line)
+            _check_hydra(override, line)
             continue
         if key in groups:
             _check_choice(override, groups[key])
             continue
         _check_option(override, line, schema, groups)
+
+
+def range_length(override: Override) -> int:
+    """Return how many values a range has; raise ConfigError for one without end."""
+    value = override.value()
+    assert isinstance(value, RangeSweep) and value.start is not None and value.stop is not None
+    if not value.step or not all(map(math.isfinite, (value.start, value.stop, value.step))):
+        raise ConfigError(
+            f"{override.input_line}: the range has no end (from {value.start} to {value.stop} in steps of "
+            f"{value.step})"
+        )
+    return max(0, math.ceil((value.stop - value.start) / value.step))
 
 
 def check_value(key: str, value: Any, schema: type) -> None:
@@ -99,21 +123,12 @@ def check_value(key: str, value: Any, schema: type) -> None:
         _check_type(key, value, option, schema)
 
 
-def quoted(value: str | Path) -> str:
-    """Return a text as a quoted value of Hydra's grammar."""
-    text = str(value)
-    mark = Quote.single if '"' in text and "'" not in text else Quote.double
-    return str(QuotedString(text, mark).with_quotes())
-
-
 def shell_argument(key: str, value: str | Path) -> str:
     """Return ``key=value`` as it is typed into a shell: quoted for Hydra and for the shell, where needed."""
     line = f"{key}={value}"
-    try:
-        is_plain = OverridesParser.create().parse_override(line).value() == str(value)
-    except HydraException:
-        is_plain = False
-    return shell_word(line if is_plain else f"{key}={quoted(value)}")
+    override = parse_or_none(line)
+    is_plain = override is not None and override.value() == str(value) and "${" not in line
+    return shell_word(line if is_plain else f"{key}={quoted_path(value)}")
 
 
 def shell_word(text: str | Path) -> str:
@@ -124,8 +139,8 @@ def shell_word(text: str | Path) -> str:
 def _parse_line(line: str) -> Override:
     if line.startswith("-"):
         raise ConfigError(
-            f"{line} is not an option: settings are written option=value (seed=1), "
-            "and the only switches are -m, --help and --version"
+            f"{line} is not an option: settings are written option=value (seed=1); --help lists the few "
+            "switches there are"
         )
     key = line.partition("=")[0].lstrip("+~")
     try:
@@ -133,6 +148,8 @@ def _parse_line(line: str) -> Override:
         _check_form(text, line)
         return OverridesParser.create().parse_override(text)
     except HydraException as error:
+        if not key.isascii():  # names of the user's own are readable by now
+            raise ConfigError(f"{key} is not an option (--help describes them)") from error
         reason = str(error).splitlines()[0]
         raise ConfigError(
             f"{line} cannot be read ({reason}): a list is written [1,2], and a text with spaces or any of "
@@ -141,19 +158,25 @@ def _parse_line(line: str) -> Override:
 
 
 def _check_form(text: str, line: str) -> None:
-    match = _LINE.fullmatch(text)
+    match = LINE.fullmatch(text)
     if match is None:
         raise ConfigError(f"{line!r} is not of the form option=value (for example seed=1)")
     if match["rest"] is None and match["prefix"] != "~":
         raise ConfigError(f"{line} has no value: write {match['key']}=value")
 
 
-def _check_sweep_extra(line: str) -> None:
+def _check_hydra(override: Override, line: str) -> None:
+    key = override.key_or_group
+    if override.is_sweep_override() and not key.startswith("hydra.sweeper.params"):
+        raise ConfigError(f"{line}: {key} belongs to the sweep itself and has one value")
+    if key.startswith("hydra/") and not isinstance(override.value(), str):
+        choices = ", ".join(describe_choices(key)) or "see its documentation"
+        raise ConfigError(f"{key}={show_value(override.value())} does not exist; choices: {choices}")
     package = SWEEP_EXTRA.get(line)
     if package is not None and not is_installed(f"hydra_plugins.{package}"):
         raise ConfigError(
             f"{line} needs the package {package.replace('_', '-')}, which is not installed: "
-            "pip install 'mappo-unity[sweep]'"
+            f"{install_command('sweep')}"
         )
 
 
@@ -167,6 +190,9 @@ def is_installed(module: str) -> bool:
 
 def _check_choice(override: Override, choices: list[str]) -> None:
     group = override.key_or_group
+    if override.is_add() or override.is_force_add() or override.is_delete():
+        name = override.value() if override.value() in choices else choices[-1]
+        raise ConfigError(f"{override.input_line}: {group} is chosen without signs: {group}={name}")
     for value in _values(override):
         if isinstance(value, str) and value in choices or (value is None and group != "env"):
             continue
@@ -189,6 +215,7 @@ def _check_option(override: Override, line: str, schema: type, groups: dict[str,
 
 
 def _check_type(key: str, value: Any, option: Option, schema: type) -> None:
+    _check_size(key, value, option)
     fits = not (option.type is bool and not isinstance(value, bool))
     try:
         OmegaConf.update(OmegaConf.structured(schema), key, value, merge=True, force_add=option.is_open)
@@ -201,6 +228,17 @@ def _check_type(key: str, value: Any, option: Option, schema: type) -> None:
     raise ConfigError(
         f"{key}={show_value(value)} does not fit: {key} must be {option.wanted}{hint} ({option.description})"
     )
+
+
+def _check_size(key: str, value: Any, option: Option) -> None:
+    """Refuse whole numbers that no counter holds; elsewhere they would end in a traceback."""
+    for number in value if isinstance(value, list) else [value]:
+        is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
+        if is_number and "whole number" in option.wanted and LARGEST < abs(number) < math.inf:
+            raise ConfigError(
+                f"{key}={show_value(value)} is out of range: whole numbers are at most {LARGEST} "
+                f"({option.description})"
+            )
 
 
 def _unknown(key: str, table: dict[str, Option], groups: dict[str, list[str]]) -> str:
@@ -220,10 +258,18 @@ def _inside(section: str, table: dict[str, Option]) -> list[str]:
 
 
 def _values(override: Override) -> Iterator[Any]:
+    """Yield the values to check: all, but only the ends of an interval and of a range."""
     value = override.value()
     if isinstance(value, IntervalSweep):
         yield value.start
         yield value.end
+    elif isinstance(value, RangeSweep):
+        number = range_length(override)
+        if number:
+            first: Any = value.start
+            kind = int if all(isinstance(end, int) for end in (first, value.stop, value.step)) else float
+            yield kind(first)
+            yield kind(first + (number - 1) * value.step)
     elif override.is_sweep_override():
         yield from override.sweep_iterator()
     else:

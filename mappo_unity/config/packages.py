@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+from mappo_unity.config.extras import install_command
 from mappo_unity.config.schema import ConfigError
 
 
@@ -26,5 +27,5 @@ def import_package(name: str) -> Any:
     except ImportError as error:
         raise ExportError(
             f"the package {name} is needed for ONNX files, but cannot be imported ({error}): "
-            "pip install 'mappo-unity[export]'"
+            f"{install_command('export')}"
         ) from error

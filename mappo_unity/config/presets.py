@@ -8,6 +8,9 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+NO_CHOICE = "none"
+"""The choice of a group that changes nothing; null means the same."""
+
 _BASIC = {  # what Hydra brings itself, and takes by default
     "hydra/launcher": {"basic": "One job of a sweep after the other (the default)."},
     "hydra/sweeper": {"basic": "One job for each combination of the values given (the default)."},

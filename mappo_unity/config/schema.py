@@ -404,6 +404,8 @@ class Config:
     """Run folder or checkpoint file to continue, in the same folder."""
     stop_at_return: Optional[float] = None
     """End the run when return_mean over a full window reaches this."""
+    max_jobs: int = 1000
+    """With -m: jobs of a grid at most; a larger one is refused before anything is checked."""
     output_dir: str = "outputs"
     """Folder under which run folders are made."""
 
@@ -414,6 +416,7 @@ class Config:
         _at_least("keep_checkpoints", self.keep_checkpoints, 1)
         _at_least("num_threads", self.num_threads, 1)
         _at_least("update_threads", self.update_threads, 1)
+        _at_least("max_jobs", self.max_jobs, 1)
         _rule("stop_at_return", self.stop_at_return, True, "must be a finite number or null")
         kind, _, index = self.device.partition(":")
         if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
@@ -506,8 +509,9 @@ def _not_empty(**options: Optional[str]) -> None:
 
 def _rule(option: str, value: float | None, holds: bool, rule: str) -> None:
     if value is not None and not (math.isfinite(value) and holds):
-        finite = "" if math.isfinite(value) or "finite" in rule else " and be finite"
-        raise ConfigError(f"{option}={value} is out of range: {option} {rule}{finite}")
+        if not math.isfinite(value) and "finite" not in rule:
+            rule += ", and finite"
+        raise ConfigError(f"{option}={value} is out of range: {option} {rule}")
 
 
 def _at_least(option: str, value: float | None, low: float) -> None:

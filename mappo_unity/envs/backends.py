@@ -15,7 +15,7 @@ from pathlib import Path
 from traceback import TracebackException
 from typing import Any
 
-from mappo_unity.config.option_table import did_you_mean
+from mappo_unity.config.option_table import did_you_mean, with_article
 from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
 from mappo_unity.protocol.protobuf import install
 
@@ -184,7 +184,8 @@ def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapp
         raise explain_error(error, name) from error
     if not isinstance(env, BaseEnv):
         raise ConfigError(
-            f"{name} returned a {type(env).__name__}; it must return a mlagents_envs.base_env.BaseEnv"
+            f"{name} returned {with_article(type(env).__name__)}; it must return a "
+            "mlagents_envs.base_env.BaseEnv"
         )
     return env
 

@@ -12,13 +12,13 @@ from typing import Any, Protocol
 
 import torch
 
-from mappo_unity.cli.first_checks import check_embedded
 from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import PlayConfig
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.camera import MovingCamera
 from mappo_unity.policies.caption import Tally
 from mappo_unity.policies.evaluate import open_policy
+from mappo_unity.policies.first_checks import check_embedded
 from mappo_unity.policies.policy import Policy
 from mappo_unity.policies.video import VideoFile, check_video
 from mappo_unity.policies.window import Window

@@ -23,6 +23,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from mappo_unity import __version__
+from mappo_unity.config.option_table import with_article
 from mappo_unity.config.packages import ExportError, import_package
 from mappo_unity.learning.actor_critic import LOG_STD_RANGE, Actor, PerMember
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
@@ -58,7 +59,7 @@ def build_model(
     graph.tell("memory_size", [0.0], [1])
     *body, head = network.net
     if not isinstance(head, nn.Linear):
-        raise ExportError(f"the policy network ends in a {type(head).__name__}, not in a Linear")
+        raise ExportError(f"the policy network ends in {with_article(type(head).__name__)}, not in a Linear")
     hidden = graph.layers(body, _features(graph, network.encoder, sensors), "net")
     if network.layout.continuous:
         _continuous_head(graph, hidden, head, network.log_std, network.layout.continuous)
@@ -134,8 +135,8 @@ class _Graph:
         kind = type(layer).__name__
         if kind not in _LAYERS:
             raise ExportError(
-                f"layer {name} of the policy network is a {kind}, which cannot be exported yet; these can: "
-                f"{', '.join(sorted(_LAYERS))}"
+                f"layer {name} of the policy network is {with_article(kind)}, which cannot be exported yet; "
+                f"these can: {', '.join(sorted(_LAYERS))}"
             )
         return _LAYERS[kind](self, layer, x, name)
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from mappo_unity.config.extras import install_command
 from mappo_unity.config.schema import ConfigError
 from mappo_unity.policies.caption import draw_caption
 from mappo_unity.policies.render import Renderer
@@ -168,9 +169,7 @@ def _check_package(option: str, package: str) -> None:
     try:
         importlib.import_module(package)
     except ImportError as error:
-        raise ConfigError(
-            f"{option} needs the package {package}: pip install 'mappo-unity[video]'"
-        ) from error
+        raise ConfigError(f"{option} needs the package {package}: {install_command('video')}") from error
 
 
 @contextmanager

@@ -156,8 +156,9 @@ def runs_below(folder: Path, count: int = 5) -> str:
     if not folder.is_dir() or folder.resolve() == folder.resolve().parent:  # nobody keeps runs in /
         return ""
     found: list[Path] = []
-    for pattern in ("*", "*/*", "*/*/*", "*/*/*/*"):
-        found += [path.parent for path in folder.glob(f"{pattern}/{CONFIG}")]
+    with suppress(OSError):  # a folder that may not be read, or goes while it is
+        for pattern in ("*", "*/*", "*/*/*", "*/*/*/*"):
+            found += [path.parent for path in folder.glob(f"{pattern}/{CONFIG}")]
     found = [path for path in found if (path / VERSIONS).is_file()]
     newest = sorted(found, key=lambda path: (path / CONFIG).stat().st_mtime, reverse=True)[:count]
     return f"; newest runs below {folder}: {', '.join(map(str, newest))}" if newest else ""
@@ -178,6 +179,8 @@ def check_there(path: Path, option: str, wanted: str = "") -> None:
         near = path.parent
         while not near.exists():
             near = near.parent
+        if Path.cwd() != near.resolve() and Path.cwd().is_relative_to(near.resolve()):
+            near = Path()  # not half the disk
         raise ConfigError(f"{option}={path} does not exist{wanted}{runs_below(near)}") from error
     except OSError as error:
         circle = "it is a symbolic link that leads in a circle"

@@ -20,9 +20,11 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from mappo_unity.config.extras import install_command
+from mappo_unity.config.overrides import shell_argument
 from mappo_unity.config.schema import ConfigError, LogBackend, LogConfig
 from mappo_unity.runs.metrics_csv import STEP, MetricsFile, keep_until, read_metrics
-from mappo_unity.runs.progress import Progress
+from mappo_unity.runs.progress import Progress, current_job
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
@@ -36,7 +38,7 @@ def check_loggers(cfg: LogConfig) -> None:
         if backend in cfg.backends and importlib.util.find_spec(backend.name) is None:
             raise ConfigError(
                 f"log.backends has {backend.name}, but the package {backend.name} is not installed: "
-                f"pip install 'mappo-unity[{backend.name}]', or leave it out (log.backends=[tensorboard]; "
+                f"{install_command(backend.name)}, or leave it out (log.backends=[tensorboard]; "
                 f"choices: {', '.join(choice.name for choice in LogBackend)})"
             )
 
@@ -69,7 +71,8 @@ class RunLog:
                 self.message(note)
         elif metrics.exists():
             raise ConfigError(
-                f"{metrics} exists already; continue that run (resume={folder}) or take another folder"
+                f"{metrics} exists already; continue that run ({shell_argument('resume', folder)}) or take "
+                "another folder"
             )
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
@@ -113,12 +116,12 @@ class RunLog:
             return f"{what}, and there is no checkpoint yet to continue from: free some space and start again"
         return (
             f"{what}; the checkpoints there stay as they are. Free some space, then continue with "
-            f"resume={self._folder}"
+            f"{shell_argument('resume', self._folder)}"
         )
 
     def message(self, text: str) -> None:
-        """Print a line above the progress line."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        """Print a line above the progress line; in a sweep it names its job."""
+        self._console.print(current_job().mark + text, markup=False, highlight=False, soft_wrap=True)
 
     def message_if_possible(self, text: str) -> None:
         """Print a line, unless whoever read them is gone or the disk they went to is full."""

@@ -8,7 +8,10 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 
 from rich.console import Console
 from rich.live import Live
@@ -18,6 +21,33 @@ PLAIN_INTERVAL_S = 2.0  # between two lines where there is no terminal
 RATE_WINDOW_S = 30.0  # over which the speed behind "left" is measured
 
 
+@dataclass(frozen=True)
+class Job:
+    """What a job of a sweep puts before its lines, and whether other jobs print beside it."""
+
+    mark: str = ""
+    is_beside_others: bool = False
+
+
+_NO_JOB = Job()
+_job: ContextVar[Job] = ContextVar("job", default=_NO_JOB)
+
+
+@contextmanager
+def job_of_sweep(number: int, is_beside_others: bool) -> Iterator[None]:
+    """Mark what is printed meanwhile as a job's: ``[job 3] 4,096/500,000 steps``."""
+    token = _job.set(Job(f"[job {number}] ", is_beside_others))
+    try:
+        yield
+    finally:
+        _job.reset(token)
+
+
+def current_job() -> Job:
+    """Return the job of a sweep that runs here; one without a mark outside of sweeps."""
+    return _job.get()
+
+
 class Progress:
     """Show how far a run is; a line updated in place needs a terminal, elsewhere lines follow each other."""
 
@@ -25,6 +55,7 @@ class Progress:
         self._console = console
         self._max_steps = max_steps
         self._clock = clock
+        self._job = current_job()
         self._marks: deque[tuple[float, int]] = deque()  # (time in s, agent steps)
         self._live: Live | None = None
         self._unprinted: str | None = None
@@ -36,8 +67,8 @@ class Progress:
         self._marks.append((now, int(row["agent_steps"])))
         while now - self._marks[0][0] > RATE_WINDOW_S and len(self._marks) > 2:
             self._marks.popleft()
-        line = describe(row, self._max_steps, self._rate(row))
-        if self._console.is_terminal and not self._console.is_dumb_terminal:
+        line = self._job.mark + describe(row, self._max_steps, self._rate(row))
+        if self._has_terminal():
             self._update_live(line)
         else:
             self._unprinted = line
@@ -51,6 +82,11 @@ class Progress:
             self._live = None
         if self._unprinted is not None:
             self._print_plain()
+
+    def _has_terminal(self) -> bool:
+        """Return whether a line can be updated in place; several processes would write over each other."""
+        terminal = self._console.is_terminal and not self._console.is_dumb_terminal
+        return terminal and not self._job.is_beside_others
 
     def _update_live(self, line: str) -> None:
         if self._live is None:  # started late: before the first row there is nothing to show

@@ -15,7 +15,6 @@ import traceback
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
 from hydra.core.global_hydra import GlobalHydra
@@ -23,21 +22,24 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from mappo_unity.cli.first_checks import check_environment
 from mappo_unity.config.behavior_lines import dotted_options, readable_lines
-from mappo_unity.config.compose import Composed, check_effect, check_factory, compose_config, to_config
-from mappo_unity.config.overrides import check_overrides, given, open_line, parse, quoted
-from mappo_unity.config.presets import conf_dir, group_choices
+from mappo_unity.config.compose import check_factory, register_root, to_config
+from mappo_unity.config.overrides import given, open_line, parse
+from mappo_unity.config.presets import conf_dir
 from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.interrupts import interrupts_wait
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.folder import NewFolder, create_folder, discard_folder, write_record
 from mappo_unity.runs.lock import locked
-from mappo_unity.stopping import Patience, job_signals, sweep_signals
+from mappo_unity.runs.progress import job_of_sweep
+from mappo_unity.stopping import Patience, in_process_of_its_own, job_signals, sweep_signals
 from mappo_unity.termination import Interrupted
+from mappo_unity.training.plan import Plan, plan_jobs
 
 RESULT = "result.json"
 GOOD = ("finished", "solved")
+_GRID = "multirun.yaml"  # Hydra's record of a grid
 _SEVERAL = "several"  # stands for env.name in the sweep's folder where the jobs differ in it
 
 
@@ -71,55 +73,32 @@ class SweepResult:
         return 0 if self.jobs and not self.error and all(job.status in GOOD for job in self.jobs) else 1
 
 
-def run_sweep(lines: list[str]) -> SweepResult:
-    """Check every job's options, then run the jobs; raises ConfigError before the first one starts."""
-    planned = plan_jobs(lines)
-    folder = _sweep_folder(lines, planned)
+def run_sweep(lines: list[str], file: Path | None = None) -> SweepResult:
+    """Check every job's options, then run the jobs; raises ConfigError before the first one starts.
+
+    `file` holds options below those of the lines.
+    """
+    plan = plan_jobs(lines, file, lambda text: print(text, flush=True))
+    folder = _sweep_folder(lines, plan)
     result, patience = SweepResult(folder.path), Patience()
     try:
         with sweep_signals(patience, parallel=given(lines, "hydra/launcher") == "joblib"):
-            _launch([*_without(lines, "hydra.sweep.dir"), f"hydra.sweep.dir={quoted(folder.path)}"])
+            _launch(
+                [*_without(lines, "hydra.sweep.dir"), f"hydra.sweep.dir={quoted_path(folder.path)}"], file
+            )
     except KeyboardInterrupt as error:
         result.signal = getattr(error, "signal", int(signal.SIGINT))
     except HydraException as error:
         discard_folder(folder)
-        raise ConfigError(f"the sweep cannot start: {error}") from error
+        raise ConfigError(f"the sweep cannot start: {' '.join(str(error).split())}") from error
     except Exception as error:
         if patience.number is None:  # else a search misses the jobs that were ended
+            _refuse_unstarted(folder, error)
             traceback.print_exc()
             result.error = f"{type(error).__name__}: {error}"
     result.signal = result.signal or patience.number
-    result.jobs = _rank(_read_results(folder.path) + _missing(folder.path, planned))
+    result.jobs = _rank(_read_results(folder.path) + _missing(folder.path, plan.jobs))
     return result
-
-
-def plan_jobs(lines: list[str]) -> list[list[str]]:
-    """Return the overrides of each job of a grid, all checked; one job with what is fixed for a search.
-
-    Raises ConfigError.
-    """
-    check_overrides(lines, Config, group_choices(), sweep=True)
-    if given(lines, "resume") is not None:
-        raise ConfigError("resume cannot be swept: continue one run at a time, without -m")
-    task = readable_lines([line for line in lines if not _is_hydra(line)])
-    hydra = [line for line in lines if _is_hydra(line)]
-    if is_search(lines):
-        fixed = [line for line in task if not parse([line])[0].is_sweep_override()]
-        jobs = [fixed]
-    else:
-        _refuse_intervals(task)
-        jobs = [list(job) for job in BasicSweeper.split_arguments(parse(task), None)[0]]
-    configs = [_compose_job(job, hydra).config for job in jobs]
-    for config in configs:
-        check_environment(config)
-    if not is_search(lines) or not _sweeps_backend(task):
-        check_effect([line for job in jobs for line in job], configs)
-    return jobs
-
-
-def is_search(lines: list[str]) -> bool:
-    """Return whether a sweeper other than Hydra's grid decides on the jobs."""
-    return given(lines, "hydra/sweeper") not in (None, "basic")
 
 
 def run_job(tree: DictConfig) -> float | None:
@@ -182,7 +161,8 @@ def _train(config: Config, folder: Path, result: JobResult) -> int | None:
     with interrupts_wait():
         from mappo_unity.training.trainer import train
 
-    outcome = train(config, folder)
+    with job_of_sweep(result.job, in_process_of_its_own()):
+        outcome = train(config, folder)
     result.status = outcome.status
     mean = outcome.return_mean
     result.return_mean = mean if mean is not None and math.isfinite(mean) else None
@@ -199,46 +179,38 @@ def _quieten() -> None:
     logging.getLogger("hydra_plugins").setLevel(logging.ERROR)
 
 
-def _launch(lines: list[str]) -> None:
+def _refuse_unstarted(folder: NewFolder, error: Exception) -> None:
+    """Raise ConfigError where a sweep broke off before its first job: its plugins refuse their options so."""
+    if any(path.is_dir() for path in folder.path.iterdir()):
+        return
+    (folder.path / _GRID).unlink(missing_ok=True)
+    discard_folder(folder)
+    reason = " ".join(str(error).split()) or type(error).__name__
+    raise ConfigError(f"the sweep cannot start: {reason} (hydra.sweeper and hydra.launcher)") from error
+
+
+def _launch(lines: list[str], file: Path | None) -> None:
     if given(lines, "hydra/sweeper") == "optuna":
         _quieten()
     GlobalHydra.instance().clear()
     search_path = create_config_search_path(str(conf_dir()))
     hydra = Hydra.create_main_hydra2("mappo-train", search_path)
     try:
-        hydra.multirun("config", run_job, [open_line(line) for line in readable_lines(lines)])
+        lines = [open_line(line) for line in readable_lines(lines)]
+        if all(given(lines, key) in (None, "basic") for key in ("hydra/sweeper", "hydra/launcher")):
+            lines = [
+                "hydra.sweeper.max_batch_size=1",
+                *lines,
+            ]  # Hydra composes a whole batch before its first job
+        hydra.multirun(register_root(lines, file=file), run_job, lines)
     finally:
         GlobalHydra.instance().clear()
 
 
-def _sweep_folder(lines: list[str], jobs: list[list[str]]) -> NewFolder:
-    hydra = [line for line in lines if _is_hydra(line)]
-    composed = [_compose_job(job, hydra) for job in jobs]
-    names = {item.config.env.name for item in composed}
+def _sweep_folder(lines: list[str], plan: Plan) -> NewFolder:
+    names = {config.env.name for config in plan.configs}
     name = names.pop() if len(names) == 1 else _SEVERAL
-    return create_folder(composed[0].sweep_dir(name), exact=given(lines, "hydra.sweep.dir") is not None)
-
-
-def _compose_job(job: list[str], hydra: list[str]) -> Composed:
-    try:
-        return compose_config([*job, *hydra])
-    except ConfigError as error:
-        raise ConfigError(f"{error} (in the job {' '.join(job) or 'as given'})") from error
-
-
-def _sweeps_backend(lines: list[str]) -> bool:
-    swept = [item for item in parse(lines) if item.is_sweep_override()]
-    return any(item.key_or_group in ("env", "env.backend") for item in swept)
-
-
-def _refuse_intervals(lines: list[str]) -> None:
-    for line in lines:
-        override = parse([line])[0]
-        if override.is_sweep_override() and not override.is_discrete_sweep():
-            raise ConfigError(
-                f"{line}: an interval has no list of values; search it with hydra/sweeper=optuna, "
-                f"or give values: {override.key_or_group}=a,b,c"
-            )
+    return create_folder(plan.first.sweep_dir(name), exact=given(lines, "hydra.sweep.dir") is not None)
 
 
 def _read_results(folder: Path) -> list[JobResult]:
@@ -248,7 +220,7 @@ def _read_results(folder: Path) -> list[JobResult]:
 
 def _missing(folder: Path, planned: list[list[str]]) -> list[JobResult]:
     """Return the jobs of a grid that left no result: not started, or their process died."""
-    multirun = folder / "multirun.yaml"
+    multirun = folder / _GRID
     if not multirun.is_file():  # a search writes none: nobody knows its jobs beforehand
         return []
     done = {job.job for job in _read_results(folder)}
@@ -265,10 +237,6 @@ def _rank(jobs: list[JobResult]) -> list[JobResult]:
         return (mean is None, -mean if mean is not None else 0.0, job.job)
 
     return sorted(jobs, key=key)
-
-
-def _is_hydra(line: str) -> bool:
-    return line.lstrip("+~").startswith(("hydra.", "hydra/"))
 
 
 def _without(lines: list[str], key: str) -> list[str]:

@@ -1,0 +1,26 @@
+"""How an extra of this package is installed here, for messages that miss one.
+
+In: the extra's name. Out: the command to type. Imports nothing of it.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+"""Where the package lies: the top of a clone, or site-packages."""
+
+
+def install_command(extra: str) -> str:
+    """Return what installs an extra: scripts/setup for a clone's own .venv, pip elsewhere."""
+    is_here = Path.cwd() == ROOT
+    setup = ROOT / "scripts" / "setup"
+    if os.name == "posix" and setup.is_file() and Path(sys.prefix).resolve() == (ROOT / ".venv").resolve():
+        return f"{'./scripts/setup' if is_here else shlex.quote(str(setup))} {extra}"
+    if (ROOT / "pyproject.toml").is_file():  # a clone, in an environment of the user's
+        place = "." if is_here else str(ROOT)
+        return f"pip install --editable {shlex.quote(f'{place}[{extra}]')}"
+    return f"pip install 'mappo-unity[{extra}]'"

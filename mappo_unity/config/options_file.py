@@ -1,0 +1,121 @@
+"""Options from a file: ``mappo-train --config my.yaml ppo.lr=1e-4``.
+
+In: command lines, a YAML file such as a run's config.yaml or a part of one. Out: the root of the options, in
+which the file wins over the presets, and the command line over the file. Composes nothing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from mappo_unity.config import presets
+from mappo_unity.config.overrides import check_value, given, shell_word
+from mappo_unity.config.schema import Config, ConfigError
+
+SWITCH = "--config"
+_SUFFIXES = (".yaml", ".yml")
+_CHOICES = ("env", "recipe")  # groups that a file may choose by name
+
+
+def take_file(lines: list[str]) -> tuple[list[str], Path | None]:
+    """Return the lines without ``--config FILE``, and the file; raise ConfigError if it is named wrongly."""
+    rest: list[str] = []
+    files: list[str] = []
+    left = iter(lines)
+    for line in left:
+        name, equals, value = line.partition("=")
+        if name == SWITCH:
+            files.append(value if equals else next(left, ""))
+        elif not equals and line.lower().endswith(_SUFFIXES):
+            raise ConfigError(f"{line} alone says nothing: a file of options is given as {_typed(line)}")
+        else:
+            rest.append(line)
+    if len(files) > 1:
+        raise ConfigError(f"{SWITCH} is given {len(files)} times ({', '.join(files)}): one file is taken")
+    if files and not files[0]:
+        raise ConfigError(f"{SWITCH} names no file: {_typed('my.yaml')}")
+    if files and given(rest, "resume") is not None:
+        raise ConfigError(
+            f"{SWITCH} and resume cannot go together: a run goes on with the options in its own config.yaml; "
+            "give those that change as option=value"
+        )
+    return rest, Path(files[0]) if files else None
+
+
+def file_root(path: Path, lines: list[str]) -> dict[Any, Any]:
+    """Return what Hydra starts from: conf/config.yaml with the file's options on top of its presets.
+
+    A recipe of the command line wins over the file, one of the file itself does not. Raises ConfigError.
+    """
+    options, choices = _read(path)
+    root: Any = OmegaConf.to_container(OmegaConf.load(presets.conf_dir() / "config.yaml"))
+    entries = [_chosen(entry, choices) for entry in root.pop("defaults")]
+    own_env = options.get("env", {}).get("name")
+    chosen = given(lines, "env")
+    if chosen is not None and own_env is not None and chosen != own_env:
+        raise ConfigError(
+            f"env={chosen} differs from env.name={own_env} in {path}: leave one of them out "
+            "(without env.name the file's other options go with any env)"
+        )
+    if given(lines, "recipe") is not None:
+        entries.remove("_self_")
+        entries.insert(1 + [_group(entry) for entry in entries].index("env"), "_self_")
+    return {"defaults": entries, **root, **options}
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return a file's options, nested, and the presets that it chooses."""
+    try:
+        saved = OmegaConf.to_container(OmegaConf.load(path))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{_typed(path)}: there is no such file") from error
+    except Exception as error:
+        raise ConfigError(f"{path} cannot be read ({' '.join(str(error).split())})") from error
+    if not isinstance(saved, dict) or not saved:
+        raise ConfigError(
+            f"{path} holds no options: it must be YAML such as a run's config.yaml, ppo: {{lr: 1e-4}}"
+        )
+    if saved.pop("resume", None) is not None:
+        raise ConfigError(f"{path}: resume belongs on the command line, mappo-train resume=RUN")
+    try:
+        choices = {group: _choice(group, saved.pop(group)) for group in _CHOICES if _is_name(saved, group)}
+        tree = OmegaConf.create({})
+        for key, value in saved.items():
+            check_value(str(key), value, Config)
+            OmegaConf.update(tree, str(key), value, merge=True)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    options: Any = OmegaConf.to_container(tree)
+    name = options.get("env", {}).get("name")
+    if name in presets.group_choices()["env"]:
+        choices.setdefault("env", name)
+    return options, choices
+
+
+def _is_name(saved: dict[Any, Any], group: str) -> bool:
+    return group in saved and not isinstance(saved[group], dict)
+
+
+def _choice(group: str, name: Any) -> str:
+    known = presets.group_choices()[group]
+    if name is None and presets.NO_CHOICE in known:
+        return presets.NO_CHOICE
+    if name not in known:
+        raise ConfigError(f"{group}={name} does not exist; choices: {', '.join(known)}")
+    return str(name)
+
+
+def _group(entry: Any) -> str:
+    return next(iter(entry)) if isinstance(entry, dict) else str(entry)
+
+
+def _chosen(entry: Any, choices: dict[str, str]) -> Any:
+    group = _group(entry)
+    return {group: choices[group]} if group in choices else entry
+
+
+def _typed(path: str | Path) -> str:
+    return f"mappo-train {SWITCH} {shell_word(path)}"

@@ -1,0 +1,49 @@
+"""The command that installs an extra is the right one for the place where the package lies."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from mappo_unity.config import extras
+from mappo_unity.config.extras import install_command
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give a folder, with a space in its name, in which the package is made to lie."""
+    place = tmp_path / "my place"
+    place.mkdir()
+    monkeypatch.setattr(extras, "ROOT", place)
+    return place
+
+
+def make_clone(place: Path) -> None:
+    (place / "pyproject.toml").touch()
+    (place / "scripts").mkdir()
+    (place / "scripts" / "setup").touch()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="scripts/setup is a shell script")
+def test_a_clone_with_its_own_environment_has_a_script(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_clone(place)
+    monkeypatch.setattr(sys, "prefix", str(place / ".venv"))
+    assert install_command("video") == f"'{place}/scripts/setup' video"
+    monkeypatch.chdir(place)
+    assert install_command("video") == "./scripts/setup video"
+
+
+def test_a_clone_in_an_environment_of_the_users_takes_pip(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_clone(place)
+    monkeypatch.setattr(sys, "prefix", str(place.parent / "other"))
+    assert install_command("video") == f"pip install --editable '{place}[video]'"
+    monkeypatch.chdir(place)
+    assert install_command("video") == "pip install --editable '.[video]'"
+
+
+def test_an_installed_package_takes_pip(place: Path) -> None:
+    assert install_command("video") == "pip install 'mappo-unity[video]'"
