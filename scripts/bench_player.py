@@ -24,12 +24,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from mappo_unity.cli.player import run as player_main
 from mappo_unity.config.compose import compose_config
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
 from mappo_unity.envs.backends import make_env_function
+from mappo_unity.errors import ConfigError
 from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.serve import Player, env_function
-from mappo_unity.protocol.serve import main as player_main
 from mappo_unity.training.episode_stats import count_decisions
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.setup import TrainingSetup, set_up

@@ -34,13 +34,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from mappo_unity.config.compose import config_to_play
-from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.backends import MakeEnv, make_env_function
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.episodes import play, standard_error
 from mappo_unity.policies.export import export_checkpoint
 from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.policies.policy_files import choose_checkpoint
+from mappo_unity.runs.options import config_to_play
 
 RUN_POLICY = Path(__file__).resolve().parents[2] / "shared" / "oracle" / "run_policy.py"
 PLAYS = ["sampled", "deterministic"]

@@ -17,9 +17,9 @@ import numpy as np
 from PIL import Image
 
 from mappo_unity.policies.policy import RandomPolicy
-from mappo_unity.policies.render import Renderer
 from mappo_unity.scenes import make_scene, scene_names
 from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.viewing.render import Renderer
 
 SIZE = (720, 450)
 LARGEST = 60_000  # bytes

@@ -35,7 +35,7 @@ from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, Ter
 from scene_ranges import RANGES, Seen  # noqa: E402
 
 from mappo_unity.scenes import make_scene, scene_names  # noqa: E402
-from mappo_unity.scenes.core.checked_play import random_actions  # noqa: E402
+from mappo_unity.scenes.contract.play import random_actions  # noqa: E402
 
 TICK_S = {"Walker": 0.01333}  # others 0.02
 WARM_UP = 0.25  # of the time

@@ -36,7 +36,7 @@ from mlagents_envs.base_env import (
 from mlagents_envs.exception import UnityActionException
 from torch import Tensor
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # gym, which vmas needs, warns of its age

@@ -33,8 +33,8 @@ def renderer() -> Iterator[Any]:
     """Return a renderer; skip where no OpenGL works."""
     films = importlib.import_module("films")
     try:
-        made = importlib.import_module("mappo_unity.policies.render").Renderer(films.CAMERA, *films.SIZE)
-    except importlib.import_module("mappo_unity.config.schema").ConfigError as error:
+        made = importlib.import_module("mappo_unity.viewing.render").Renderer(films.CAMERA, *films.SIZE)
+    except importlib.import_module("mappo_unity.errors").ConfigError as error:
         pytest.skip(str(error))
     yield made
     made.close()

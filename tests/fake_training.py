@@ -34,7 +34,7 @@ def why_over(cfg: Config, path: Path) -> str | None:
     return None
 
 
-def train(cfg: Config, folder: Path, resume_from: Path | None = None) -> Outcome:
+def train(cfg: Config, folder: Path, resume_from: Path | None = None, *show: object) -> Outcome:
     """Return seed - 1000 x learning rate as the mean return."""
     if cfg.seed == 13:
         raise RuntimeError("unlucky")

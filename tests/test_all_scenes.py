@@ -12,13 +12,14 @@ import pytest
 from test_train import assert_same, rows, without_times
 
 from mappo_unity.config.compose import compose_config
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.episodes import summarize
 from mappo_unity.policies.evaluate import play
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.scenes import make_scene, scene_names
-from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.trainer import Outcome, train
 

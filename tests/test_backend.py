@@ -20,13 +20,14 @@ import numpy as np
 import pytest
 
 from mappo_unity.cli import train_main
-from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
+from mappo_unity.cli.player import run as player_main
+from mappo_unity.config.schema import Backend, EnvConfig
 from mappo_unity.envs.backends import PLAYER_STRIDE, make_env_function
+from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.protocol.parallel_players import SeveralPlayers
 from mappo_unity.protocol.ports import FORBIDDEN, check_port
 from mappo_unity.protocol.process import find_executable
 from mappo_unity.protocol.restarting_player import SEED_STRIDE, RestartingPlayer
-from mappo_unity.protocol.serve import main as player_main
 from mappo_unity.protocol.server import Link
 from mappo_unity.scenes import make_scene
 
@@ -505,11 +506,11 @@ class TestCustom:
             ("test_backend:refuse", "^size=3 is odd$"),
             (
                 "broken_by_hand:make",
-                "module 'broken_by_hand' cannot be imported: it raised ZeroDivisionError: ",
+                "the module broken_by_hand cannot be imported: it raised ZeroDivisionError: ",
             ),
             (
                 "absent_module:make",
-                "module 'absent_module' cannot be imported: it raised ModuleNotFoundError: ",
+                "the module absent_module cannot be imported: it raised ModuleNotFoundError: ",
             ),
         ],
     )

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
-from mappo_unity.policies.camera import LAG_S, MovingCamera
-from mappo_unity.policies.caption import Tally
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.core.shapes import Camera, Drawing, Follow
 from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.viewing.camera import LAG_S, MovingCamera
+from mappo_unity.viewing.caption import Tally
 
 Rows = dict[int, float]  # agent id -> reward
 

@@ -23,7 +23,8 @@ from mappo_unity import __version__
 from mappo_unity.cli import eval_main, train_main
 from mappo_unity.config.option_table import option_table
 from mappo_unity.config.presets import all_groups, describe_choices
-from mappo_unity.config.schema import Config, ConfigError, EvalConfig
+from mappo_unity.config.schema import Config, EvalConfig
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs import lock as run_lock
 from mappo_unity.runs.folder import create_folder, find_run, read_versions
 from mappo_unity.runs.lock import locked
@@ -38,7 +39,7 @@ class FakeTraining:
         self.error: BaseException | None = None
         self.writes = True
 
-    def train(self, cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+    def train(self, cfg: Config, folder: Path, checkpoint: Path | None = None, *show: object) -> Outcome:
         self.calls.append((cfg, folder, checkpoint))
         if self.writes:
             (folder / "metrics.csv").write_text("agent_steps\n")
@@ -208,7 +209,7 @@ def test_a_mistake_that_the_training_finds_leaves_nothing(
 
 @pytest.mark.parametrize("named", [False, True])
 def test_players_that_came_up_in_vain_leave_nothing(training: FakeTraining, named: bool) -> None:
-    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None, *show: object) -> Outcome:
         log = folder / "players" / "Player-0.log"
         log.parent.mkdir()
         log.write_text("a player's words")
@@ -223,7 +224,7 @@ def test_a_refused_continuation_with_players_keeps_its_options(training: FakeTra
     train_main(["hydra.run.dir=mine"])
     before = Path("mine/config.yaml").read_text()
 
-    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None, *show: object) -> Outcome:
         (folder / "players").mkdir()
         (folder / "players" / "Player-0.log").write_text("a player's words")
         raise ConfigError("another network")
@@ -242,7 +243,7 @@ def test_what_a_run_has_done_outlives_its_error(training: FakeTraining) -> None:
 def test_a_run_folder_that_is_removed_meanwhile(
     training: FakeTraining, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None, *show: object) -> Outcome:
         shutil.rmtree(folder)
         raise ConfigError("the run folder was removed")
 
@@ -348,7 +349,7 @@ def test_a_run_in_training_takes_no_second_one(
 def test_a_run_holds_its_lock_while_it_trains(training: FakeTraining) -> None:
     seen: list[str] = []
 
-    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Outcome:
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None, *show: object) -> Outcome:
         with pytest.raises(ConfigError, match="is being trained by another process"), locked(folder):
             pass
         seen.append(folder.name)

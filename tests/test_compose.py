@@ -11,21 +11,17 @@ from pathlib import Path
 import pytest
 
 from mappo_unity.config import compose, presets
-from mappo_unity.config.compose import (
-    check_effect,
-    check_factory,
-    compose_config,
-    compose_plain,
-    compose_resumed,
-    load_config,
-)
+from mappo_unity.config.compose import check_effect, compose_config, compose_plain, load_config
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.option_table import option_table
 from mappo_unity.config.overrides import given, shell_argument
 from mappo_unity.config.per_behavior import behavior_config
 from mappo_unity.config.presets import conf_dir
-from mappo_unity.config.schema import Activation, Config, ConfigError, EvalConfig, LogBackend
+from mappo_unity.config.schema import Activation, Config, EvalConfig, LogBackend
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.folder import CONFIG, write_record
+from mappo_unity.runs.options import compose_resumed
+from mappo_unity.scenes.factory import check_factory
 
 FILES = sorted(path.relative_to(conf_dir()).as_posix() for path in conf_dir().rglob("*.yaml"))
 FACTORY = "env.factory=test_compose:make_nothing"
@@ -241,14 +237,14 @@ def test_an_option_without_effect_is_refused_when_a_run_goes_on(tmp_path: Path) 
     ("factory", "words"),
     [
         ("no_such_module:f", ["no_such_module cannot be imported", "No module named"]),
-        ("test_compose:make_nothin", ["has no make_nothin", "did you mean make_nothing"]),
+        ("test_compose:make_nothin", ["has no function 'make_nothin'", "did you mean make_nothing"]),
         ("test_compose:NOT_A_FUNCTION", ["is an int", "must be a function that returns a BaseEnv"]),
     ],
 )
 def test_a_wrong_factory_is_told(factory: str, words: list[str]) -> None:
     config = compose_config(["env=custom", f"env.factory={factory}"]).config
     with pytest.raises(ConfigError) as caught:
-        check_factory(config)
+        check_factory(config.env)
     for word in (f"env.factory={factory}", *words):
         assert word in str(caught.value)
 
@@ -257,7 +253,7 @@ def test_a_factory_of_the_working_directory_counts(tmp_path: Path, monkeypatch: 
     (tmp_path / "my_own_simulator.py").write_text("def make(seed):\n    pass\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))  # what is added goes afterwards
-    check_factory(compose_config(["env=custom", "env.factory=my_own_simulator:make"]).config)
+    check_factory(compose_config(["env=custom", "env.factory=my_own_simulator:make"]).config.env)
 
 
 def test_a_missing_sweep_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,15 +21,17 @@ from mlagents_envs.base_env import (
 )
 
 from mappo_unity.cli import eval_main, train_main
-from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
-from mappo_unity.envs import contract, unity_env
+from mappo_unity.config.schema import Backend, EnvConfig
+from mappo_unity.envs import unity_env
 from mappo_unity.envs.backends import make_env_function
-from mappo_unity.envs.contract import ContractError, EnvironmentDataError
-from mappo_unity.envs.record_check import RecordCheck
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.policies.episodes import play
 from mappo_unity.policies.policy import RandomPolicy
-from mappo_unity.scenes.core.contract import check_env, main
+from mappo_unity.scenes.contract import rules as contract
+from mappo_unity.scenes.contract.check import check_env, main
+from mappo_unity.scenes.contract.records import RecordCheck
+from mappo_unity.scenes.contract.rules import ContractError, EnvironmentDataError
 
 
 @pytest.fixture

@@ -16,14 +16,15 @@ import pytest
 from test_train import assert_same
 
 from mappo_unity.cli import eval_main, train_main
-from mappo_unity.config.compose import compose_config, compose_resumed, config_to_play
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.envs.backends import load_factory
+from mappo_unity.config.compose import compose_config
+from mappo_unity.config.user_modules import folder_of
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs import folder as runs
-from mappo_unity.scenes.core.contract import main as check_main
-from mappo_unity.training.trainer import Trainer, train
-from mappo_unity.user_modules import folder_of
+from mappo_unity.runs.options import compose_resumed, config_to_play
+from mappo_unity.scenes.contract.check import main as check_main
+from mappo_unity.scenes.factory import load_factory
+from mappo_unity.training.trainer import train
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "custom_env.py"
 FACTORY = "env.factory=custom_env:make"
@@ -99,11 +100,8 @@ def test_a_resumed_run_goes_on_to_the_bit(tmp_path: Path) -> None:
         folder.mkdir()
         for max_steps in steps:
             cfg = compose_config([*TINY, "ppo.lr_schedule=constant", f"max_steps={max_steps}"]).config
-            trainer = Trainer(cfg, folder)
-            if checkpoint.checkpoints_in(folder):
-                trainer.load(checkpoint.newest_good(folder)[0])
-            trainer.run()
-            trainer.close()
+            earlier = checkpoint.checkpoints_in(folder)
+            train(cfg, folder, checkpoint.newest_good(folder)[0] if earlier else None)
     states = [checkpoint.load(checkpoint.newest_good(folder)[0]) for folder in (whole, parts)]
     for name in ("learners", "env"):
         assert_same(states[0][name], states[1][name])
@@ -187,7 +185,7 @@ def test_the_folder_of_a_factory(
 def test_a_module_that_fails_is_not_called_absent(
     beside: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mappo_unity.user_modules import look_in
+    from mappo_unity.config.user_modules import look_in
 
     monkeypatch.setattr(sys, "modules", dict(sys.modules))
     (beside / "pack").mkdir()

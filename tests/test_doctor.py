@@ -14,8 +14,8 @@ import pytest
 
 from mappo_unity.cli import doctor_main
 from mappo_unity.cli.doctor import CURES, diagnose, port_state
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.protocol.serve import main as player_main
+from mappo_unity.cli.player import run as player_main
+from mappo_unity.errors import ConfigError
 
 BAD_PLAYER = Path(__file__).with_name("bad_player.py")
 
@@ -126,7 +126,7 @@ def test_an_opengl_that_keeps_mujoco_from_loading(monkeypatch: pytest.MonkeyPatc
         raise AttributeError("'NoneType' object has no attribute 'glGetError'")
 
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setattr("mappo_unity.policies.screens.importlib.import_module", fail)
+    monkeypatch.setattr("mappo_unity.viewing.screens.importlib.import_module", fail)
     code, text = examine()
     assert code == 1 and "environment variable MUJOCO_GL=osmesa ('NoneType' object has no attribute" in text
     assert "unset it, or set it to egl or osmesa and install that" in text

@@ -12,8 +12,8 @@ import torch
 from fakes import Record, ScriptedEnv, behavior_spec
 
 from mappo_unity.cli import train_main
-from mappo_unity.config.schema import ConfigError, EnvironmentFailure
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.policies.episodes import play
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.runs import checkpoint

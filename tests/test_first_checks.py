@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from mappo_unity.config.schema import Backend, Config, ConfigError, EnvConfig, PlayConfig
+from mappo_unity.config.schema import Backend, Config, EnvConfig, PlayConfig
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.first_checks import check_embedded, check_environment, check_film, check_out
 from mappo_unity.policies.policy_files import (
     Kind,

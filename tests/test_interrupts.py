@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from mappo_unity.interrupts import interrupts_end, interrupts_wait
+from mappo_unity.signals import interrupts_end, interrupts_wait
 
 
 def test_an_interrupt_comes_after_the_block():
@@ -50,7 +50,7 @@ def test_an_error_of_the_block_is_not_hidden_and_other_threads_do_nothing():
 def test_an_interrupt_before_anything_is_begun_ends_with_one_line():
     code = (
         "import os, signal, time\n"
-        "from mappo_unity.interrupts import interrupts_end\n"
+        "from mappo_unity.signals import interrupts_end\n"
         "print('printed', end='')\n"
         "with interrupts_end('mappo-eval'):\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"

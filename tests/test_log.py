@@ -19,7 +19,8 @@ import pytest
 from rich.console import Console
 
 from mappo_unity.config.extras import install_command
-from mappo_unity.config.schema import ConfigError, LogBackend, LogConfig
+from mappo_unity.config.schema import LogBackend, LogConfig
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.logger import RunLog, read_metrics
 from mappo_unity.runs.metrics_csv import MetricsFile, keep_until
 from mappo_unity.runs.progress import Progress, describe, job_of_sweep

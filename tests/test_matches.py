@@ -5,8 +5,8 @@ import pytest
 from fakes import behavior_spec
 from mlagents_envs.base_env import ActionSpec, BaseEnv, DecisionSteps, TerminalSteps
 
-from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.rounds import Episode
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.matches import Score, count, find_sides, play_matches, wilson
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.scenes import make_scene

@@ -15,7 +15,7 @@ from mlagents_envs.base_env import (
 )
 from onnx_fakes import data_of, make, official_policy
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.onnx_policy import OnnxFolder, OnnxPolicy
 
 WALL_JUMP = (3, 3, 3, 2)

@@ -14,7 +14,8 @@ import yaml
 from mappo_unity.cli import train_main
 from mappo_unity.config.compose import compose_config, load_config
 from mappo_unity.config.options_file import take_file
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
 from mappo_unity.training.sweep import run_sweep
 
 

@@ -6,7 +6,8 @@ import pytest
 
 from mappo_unity.config.compose import compose_plain
 from mappo_unity.config.plain_options import check_form
-from mappo_unity.config.schema import ConfigError, EvalConfig, PlayConfig
+from mappo_unity.config.schema import EvalConfig, PlayConfig
+from mappo_unity.errors import ConfigError
 
 
 @pytest.mark.parametrize(

@@ -15,19 +15,19 @@ from mappo_unity.cli import play_main
 from mappo_unity.config.schema import (
     CollectConfig,
     Config,
-    ConfigError,
     EnvConfig,
     LogConfig,
     ModelConfig,
     PlayConfig,
     PPOConfig,
 )
-from mappo_unity.policies.film import Pace, open_scene, play, policy_of
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.onnx_policy import OnnxFolder
-from mappo_unity.policies.window import Window
 from mappo_unity.runs import folder as runs
 from mappo_unity.scenes.core.shapes import RED, ball
 from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.viewing.play import Pace, open_scene, play, policy_of
+from mappo_unity.viewing.window import Window
 
 
 def test_videos_run_at_the_pace_of_their_scene() -> None:

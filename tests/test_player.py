@@ -15,11 +15,12 @@ import pytest
 from fakes import vector_spec
 
 from mappo_unity.cli import player_main
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.cli.player import run as main
+from mappo_unity.errors import ConfigError
 from mappo_unity.protocol import decode, encode, messages
 from mappo_unity.protocol.batch_encoding import varint_columns
 from mappo_unity.protocol.player_log import PlayerLog
-from mappo_unity.protocol.serve import Player, env_function, main, play, serve
+from mappo_unity.protocol.serve import Player, env_function, play, serve
 from mappo_unity.scenes import make_scene, scene_names
 
 from mlagents_envs.base_env import (  # isort: skip  # mappo_unity lets it import

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mappo_unity.protocol.serve import main as player_main
+from mappo_unity.cli.player import run as player_main
 
 COMMAND = "import sys; from mappo_unity.cli import train_main; sys.exit(train_main())"
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mappo_unity.cli import train_main
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import CONFIG
 from mappo_unity.runs.logger import RunLog

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mlagents_envs.base_env import ActionTuple
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes import make_scene, scene_names
 from mappo_unity.scenes.ball3d.scene import Ball3D, limited_turn, turned
 

@@ -14,7 +14,7 @@ import pytest
 from mlagents_envs.base_env import ActionTuple
 from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.core.scene import Scene
 from mappo_unity.scenes.core.specs import Behavior, Parameter, Sensor
 

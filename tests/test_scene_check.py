@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
-from mappo_unity.envs.contract import ContractError
 from mappo_unity.scenes.ball3d.scene import Ball3D
-from mappo_unity.scenes.core.checked_play import random_actions
-from mappo_unity.scenes.core.contract import check_env, main
-from mappo_unity.scenes.core.lifecycle import Lives
+from mappo_unity.scenes.contract.check import check_env, main
+from mappo_unity.scenes.contract.lifecycle import Lives
+from mappo_unity.scenes.contract.play import random_actions
+from mappo_unity.scenes.contract.rules import ContractError
 
 NAME = "3DBall?team=0"
 Steps = tuple[DecisionSteps, TerminalSteps]

@@ -7,15 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from mappo_unity.config.schema import ConfigError, PlayConfig
-from mappo_unity.policies.screens import check_mujoco, check_screen
+from mappo_unity.config.schema import PlayConfig
+from mappo_unity.errors import ConfigError
+from mappo_unity.scenes.mujoco_check import check_mujoco
+from mappo_unity.viewing.screens import check_screen
 
 
 def test_an_opengl_that_mujoco_cannot_load(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(name: str) -> None:
         raise RuntimeError(f"invalid value\nfor {name}")
 
-    monkeypatch.setattr("mappo_unity.policies.screens.importlib.import_module", fail)
+    monkeypatch.setattr("mappo_unity.viewing.screens.importlib.import_module", fail)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     check_mujoco()
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
@@ -25,7 +27,7 @@ def test_an_opengl_that_mujoco_cannot_load(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
 def test_an_opengl_that_needs_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mappo_unity.policies.render import check_opengl
+    from mappo_unity.viewing.render import check_opengl
 
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)

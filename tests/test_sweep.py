@@ -15,10 +15,10 @@ from pathlib import Path
 import fake_training
 import pytest
 
-from mappo_unity import stopping
 from mappo_unity.cli import train_main
 from mappo_unity.config.compose import compose_config, load_config
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
+from mappo_unity.training import sweep_signals as stopping
 from mappo_unity.training.plan import plan_jobs
 from mappo_unity.training.sweep import run_sweep
 
@@ -312,11 +312,11 @@ def test_a_search_of_processes_ends_by_its_signal(tmp_path: Path) -> None:
 
 def test_a_second_signal_waits_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stopping, "_hand_on", lambda number: None)
-    patience = stopping.Patience()
+    patience = stopping.SweepSignalHandler()
     with stopping.sweep_signals(patience, parallel=True):
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)  # to the process, and to its group: that is one
-        monkeypatch.setattr(stopping, "ECHO_S", -1.0)
+        monkeypatch.setattr(stopping, "DUPLICATE_SIGNAL_S", -1.0)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert patience.number == signal.SIGINT
@@ -326,8 +326,11 @@ def test_a_second_signal_waits_no_longer(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_the_wait_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stopping, "_hand_on", lambda number: None)
     monkeypatch.setattr(stopping, "GRACE_S", 0.1)
-    monkeypatch.setattr(stopping, "ECHO_S", 0.05)
-    with pytest.raises(KeyboardInterrupt), stopping.sweep_signals(stopping.Patience(), parallel=True):
+    monkeypatch.setattr(stopping, "DUPLICATE_SIGNAL_S", 0.05)
+    with (
+        pytest.raises(KeyboardInterrupt),
+        stopping.sweep_signals(stopping.SweepSignalHandler(), parallel=True),
+    ):
         signal.raise_signal(signal.SIGTERM)
         time.sleep(5)
 

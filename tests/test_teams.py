@@ -8,9 +8,10 @@ from mlagents_envs.base_env import ActionSpec
 from torchrl.envs.utils import check_env_specs
 
 from mappo_unity.config.per_behavior import behavior_config, check_behaviors
-from mappo_unity.config.schema import Config, ConfigError, CriticKind, ModelConfig
+from mappo_unity.config.schema import Config, CriticKind, ModelConfig
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.errors import ConfigError
 from mappo_unity.learning.critics import CentralCritic, PooledCritic
 from mappo_unity.learning.distributions import ActionDistribution, ActionLayout
 from mappo_unity.learning.encoders import Encoder, ObsLayout

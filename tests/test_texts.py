@@ -17,8 +17,9 @@ from mappo_unity.cli import eval_main, export_main, play_main, train_main
 from mappo_unity.config.behavior_lines import dotted_options, readable_line, readable_lines
 from mappo_unity.config.compose import compose_config, compose_plain, load_config
 from mappo_unity.config.overrides import given, parse, shell_argument
-from mappo_unity.config.schema import Config, ConfigError, EvalConfig, ExportConfig, PlayConfig
+from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, PlayConfig
 from mappo_unity.config.text_lines import key_name, key_spelling, literal_lines
+from mappo_unity.errors import ConfigError
 from mappo_unity.training.sweep import run_sweep
 
 NAMES = [

@@ -16,14 +16,13 @@ from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import (
     CollectConfig,
     Config,
-    ConfigError,
     EnvConfig,
-    EnvironmentFailure,
     LogConfig,
     MatchConfig,
     ModelConfig,
     PPOConfig,
 )
+from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.policies.matches import Score
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.checkpoint import CheckpointError
@@ -219,7 +218,7 @@ def test_a_signal_to_the_process_and_to_its_group_is_one(tmp_path, monkeypatch):
     outcome = train(options(4), tmp_path)
     assert (outcome.status, outcome.signal) == ("interrupted", signal.SIGINT)
     assert outcome.last_checkpoint.is_file()
-    monkeypatch.setattr(stop_signals, "ECHO_S", -1.0)
+    monkeypatch.setattr(stop_signals, "DUPLICATE_SIGNAL_S", -1.0)
     with pytest.raises(KeyboardInterrupt):
         train(options(4), tmp_path / "other")
 

@@ -8,10 +8,10 @@ from fakes import ScriptedEnv, behavior_spec
 from mlagents_envs.base_env import ActionSpec
 from torchrl.envs.utils import check_env_specs
 
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.envs.contract import EnvironmentDataError
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes import make_scene
+from mappo_unity.scenes.contract.rules import EnvironmentDataError
 
 END, CUT = "terminated", "interrupted"
 

@@ -12,11 +12,7 @@ from films import CAMERA, SIZE, frames_of, gif_durations_ms, where
 
 from mappo_unity.cli import play_main
 from mappo_unity.config.extras import install_command
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.policies.antialias import smooth_edges
-from mappo_unity.policies.caption import draw_caption
-from mappo_unity.policies.render import Renderer
-from mappo_unity.policies.video import VideoFile, check_video
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.core.shapes import (
     BLUE,
     GREEN,
@@ -29,6 +25,10 @@ from mappo_unity.scenes.core.shapes import (
     capsule,
     yaw_rotation,
 )
+from mappo_unity.viewing.antialias import smooth_edges
+from mappo_unity.viewing.caption import draw_caption
+from mappo_unity.viewing.render import Renderer
+from mappo_unity.viewing.video import VideoFile, check_video
 
 
 def test_pictures_show_right_up_and_ahead_as_unity_does(renderer: Renderer) -> None:

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from mappo_unity.config.compose import compose_config
-from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.backends import make_env_function
-from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.errors import ConfigError
+from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.training.trainer import train
 
 pytest.importorskip("vmas", reason="needs the package vmas (extra 'bench')")

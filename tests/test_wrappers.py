@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from mappo_unity.protocol.serve import main
+from mappo_unity.cli.player import run as main
 
 FOLDER = os.environ.get("MAPPO_WRAPPERS", "")
 CLIENT = r"""

@@ -15,15 +15,20 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mappo_unity.cli.arguments import check_duration, check_range
 from mappo_unity.cli.findings import CURES, Report, Say
 from mappo_unity.cli.switches import Once, Parser, number, whole_number
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.policies.screens import check_mujoco
+from mappo_unity.config.ranges import check_duration, check_range
+from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.ports import port_state
+from mappo_unity.scenes.mujoco_check import check_mujoco
 
 PACKAGES = ("torch", "torchrl", "tensordict", "mlagents-envs", "protobuf", "grpcio", "numpy", "mujoco")
 EDITOR_PORT = 5004
+
+
+def run(lines: list[str]) -> int:
+    """Examine and print; return the exit code."""
+    return diagnose(lines, print)
 
 
 def diagnose(arguments: Sequence[str], say: Say) -> int:

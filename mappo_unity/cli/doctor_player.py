@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mappo_unity.cli.findings import CURES, Report
-from mappo_unity.config.schema import ConfigError, EnvironmentFailure
+from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.protocol.ports import check_port
 
 TIME_SCALES = (1.0, 20.0, 100.0)
@@ -158,7 +158,7 @@ def _examine_rhythm(report: Report, player: Any, steps: int = PATIENCE_STEPS) ->
 
 
 def _examine_contract(report: Report, player: Any) -> None:
-    from mappo_unity.scenes.core.contract import ContractError, check_env
+    from mappo_unity.scenes.contract.check import ContractError, check_env
 
     try:
         seen = check_env(player, steps=PATIENCE_STEPS)

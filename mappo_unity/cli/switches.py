@@ -9,7 +9,7 @@ import argparse
 import difflib
 from typing import Any
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 
 class Parser(argparse.ArgumentParser):

@@ -9,7 +9,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from mappo_unity.config.option_table import show_value
-from mappo_unity.config.schema import Backend, Config, ConfigError, EnvConfig
+from mappo_unity.config.schema import Backend, Config, EnvConfig
+from mappo_unity.errors import ConfigError
 
 _STARTED = (Backend.player, Backend.registry)
 _UNITY = (Backend.player, Backend.editor, Backend.registry)

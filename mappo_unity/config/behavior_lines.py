@@ -17,8 +17,8 @@ from hydra.core.override_parser.types import Glob, QuotedString
 
 from mappo_unity.config.option_table import show_value
 from mappo_unity.config.presets import NO_CHOICE, group_choices
-from mappo_unity.config.schema import ConfigError
 from mappo_unity.config.text_lines import key_name, key_spelling, parse_or_none, quote_words, quoted
+from mappo_unity.errors import ConfigError
 
 OPEN = {"behaviors": "behaviors.Goalie.ppo.lr=1e-4", "env.params": "env.params.mass=2"}
 """The options that take names of the user's own below them, each with an example."""

@@ -6,7 +6,6 @@ Every mistake is a ConfigError. Nothing is created here, and torch is not import
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,23 +19,21 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mappo_unity.config import backend_options
 from mappo_unity.config.behavior_lines import OPEN
-from mappo_unity.config.option_table import did_you_mean, option_table, with_article
+from mappo_unity.config.option_table import option_table
 from mappo_unity.config.options_file import file_root
 from mappo_unity.config.overrides import (
     SWEEP_EXTRA,
     check_overrides,
     check_value,
-    given,
     given_options,
     open_line,
     parse,
 )
 from mappo_unity.config.plain_options import check_form
 from mappo_unity.config.presets import NO_CHOICE, conf_dir, group_choices
-from mappo_unity.config.schema import Config, ConfigError
-from mappo_unity.config.text_lines import key_name, literal_lines, quoted
-from mappo_unity.runs.folder import CONFIG, factory_folder, find_run
-from mappo_unity.user_modules import add_working_directory, look_in
+from mappo_unity.config.schema import Config
+from mappo_unity.config.text_lines import key_name, literal_lines
+from mappo_unity.errors import ConfigError
 
 _ALWAYS_SAVED = ("env", "output_dir")
 """The first and the last option of a run's config.yaml: a file that lacks one has been cut off."""
@@ -109,36 +106,6 @@ def register_schema() -> ConfigStore:
     return store
 
 
-def compose_resumed(lines: list[str], base: Path) -> Config:
-    """Compose the options of a run that goes on: its config.yaml, then overrides; raise ConfigError.
-
-    What says which run it is (env, env.name, the folders) cannot be overridden.
-    """
-    saved = load_config(base)
-    chosen = given(lines, "env")
-    if chosen is not None and chosen != saved.env.name:
-        raise ConfigError(
-            f"env={chosen} differs from the run's env={saved.env.name}: a run goes on in its own env; "
-            "leave env out, or start a new run without resume"
-        )
-    rest = [line for line in lines if parse([line])[0].key_or_group != "env"]
-    for key in ("env.name", "output_dir", "hydra.run.dir"):
-        if given(rest, key) is not None:
-            raise ConfigError(
-                f"{key} cannot change with resume: the run goes on in its own folder {base.parent}"
-            )
-    config = compose_config(rest, base).config
-    if config.seed != saved.seed:
-        raise ConfigError(
-            f"seed={config.seed} cannot change with resume: the run has seed={saved.seed}, and its random "
-            "numbers go on where they were; leave seed out, or start a new run without resume"
-        )
-    check_effect(rest, [config])
-    if config.env.factory is not None:
-        look_in(factory_folder(base.parent), config.env.factory, base.parent)
-    return config
-
-
 def load_config(path: Path) -> Config:
     """Return the options that a run's config.yaml holds; raise ConfigError, which names the file."""
     try:
@@ -147,27 +114,6 @@ def load_config(path: Path) -> Config:
         if str(error).startswith(str(path)):
             raise
         raise ConfigError(f"{path}: {error}") from error
-
-
-def config_to_play(run: Path, env: str | None) -> Config:
-    """Return the options of the environment in which a run or an ONNX file is played; raise ConfigError.
-
-    `env` names a preset; without it it is that of the run's folder, or of the one the file lies in. Then the
-    module of env.factory may also lie where the run found it.
-    """
-    if env is not None:
-        return compose_config([f"env={quoted(env)}"]).config
-    try:
-        folder = find_run(run, "run")
-        config = load_config(folder / CONFIG)
-    except ConfigError as error:
-        if not run.is_file() and not list(run.glob("*.onnx")):
-            raise
-        choices = ", ".join(group_choices()["env"])
-        raise ConfigError(f"{error}; or say in which environment to play it: env=NAME ({choices})") from error
-    if config.env.factory is not None:
-        look_in(factory_folder(folder), config.env.factory, folder)
-    return config
 
 
 def to_config(tree: DictConfig) -> Config:
@@ -205,40 +151,6 @@ def compose_plain(lines: list[str], schema: type) -> Any:
 def check_effect(lines: list[str], configs: list[Config]) -> None:
     """Refuse options on the command line that none of the runs it stands for looks at; raise ConfigError."""
     backend_options.check_effect(given_options(lines), configs)
-
-
-def check_factory(config: Config) -> None:
-    """Check that env.factory, if given, imports and can be called; the working directory counts.
-
-    Raises ConfigError.
-    """
-    factory = config.env.factory
-    if factory is None:
-        return
-    add_working_directory()
-    module_name, _, name = factory.partition(":")
-    try:
-        module = importlib.import_module(module_name)
-    except Exception as error:  # whatever the user's module raises is the user's to see
-        reason = f"{type(error).__name__}: {error}"
-        raise ConfigError(
-            f"env.factory={factory}: the module {module_name} cannot be imported ({reason})"
-        ) from error
-    if not hasattr(module, name):
-        names = [item for item, value in vars(module).items() if _is_own_function(value, module_name)]
-        raise ConfigError(
-            f"env.factory={factory}: {module_name} has no {name}{did_you_mean(name, names)}; "
-            f"callable there: {', '.join(names[:20]) or 'nothing of its own'}"
-        )
-    if not callable(getattr(module, name)):
-        kind = with_article(type(getattr(module, name)).__name__)
-        raise ConfigError(
-            f"env.factory={factory}: {name} is {kind}, but must be a function that returns a BaseEnv"
-        )
-
-
-def _is_own_function(value: Any, module: str) -> bool:
-    return callable(value) and getattr(value, "__module__", None) == module
 
 
 def _resumed_root(base: Path) -> dict[Any, Any]:

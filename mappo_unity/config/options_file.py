@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 
 from mappo_unity.config import presets
 from mappo_unity.config.overrides import check_value, given, shell_word
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
 
 SWITCH = "--config"
 _SUFFIXES = (".yaml", ".yml")

@@ -26,8 +26,9 @@ from mappo_unity.config.behavior_lines import readable_line
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table, show_value
 from mappo_unity.config.presets import describe_choices
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
 from mappo_unity.config.text_lines import LINE, parse_or_none, quoted_path
+from mappo_unity.errors import ConfigError
 
 SWEEP_EXTRA = {
     "hydra/launcher=joblib": "hydra_joblib_launcher",

@@ -9,7 +9,7 @@ import importlib
 from typing import Any
 
 from mappo_unity.config.extras import install_command
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 
 class ExportError(ConfigError):

@@ -13,7 +13,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mappo_unity.config.schema import Config, ConfigError, ModelConfig, PPOConfig
+from mappo_unity.config.schema import Config, ModelConfig, PPOConfig
+from mappo_unity.errors import ConfigError
 
 SECTIONS = ("model", "ppo")
 

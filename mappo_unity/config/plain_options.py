@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from mappo_unity.config.option_table import Option, did_you_mean, option_table
 from mappo_unity.config.overrides import parse, shell_word
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 
 def check_form(lines: Sequence[str], schema: type) -> None:

@@ -13,23 +13,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Optional
 
-
-class ConfigError(ValueError):
-    """A mistake in the options; the message names the option, its value and the rule.
-
-    `details`: lines to print below it, such as a traceback of the user's code.
-    """
-
-    details: tuple[str, ...] = ()
-
-
-class EnvironmentFailure(RuntimeError):
-    """An environment that ran has failed for good; the message says how, and where its log is.
-
-    `details`: lines to print below it, such as a traceback of the user's code.
-    """
-
-    details: tuple[str, ...] = ()
+from mappo_unity.errors import ConfigError
 
 
 class Backend(Enum):

@@ -17,7 +17,7 @@ from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 
 from mappo_unity.config.option_table import option_table, without_none
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 ONE_FOLDER = ("resume", "output_dir", "hydra.run.dir", "hydra.sweep.dir")
 """Options that name one place, in a sweep too."""

@@ -6,37 +6,27 @@ In: `EnvConfig`. Out: a function ``seed -> BaseEnv``. The only module that knows
 
 from __future__ import annotations
 
-import importlib
-import inspect
-import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from traceback import TracebackException
 from typing import Any
 
-from mappo_unity.config.option_table import did_you_mean, with_article
-from mappo_unity.config.schema import Backend, ConfigError, EnvConfig, EnvironmentFailure
+from mappo_unity.config.schema import Backend, EnvConfig
+from mappo_unity.errors import ConfigError
+from mappo_unity.protocol.ports import EDITOR_PORT
 from mappo_unity.protocol.protobuf import install
 
 install()
 
 from mlagents_envs.base_env import BaseEnv  # noqa: E402
 
-from mappo_unity.envs.user_env import GuardedEnv  # noqa: E402
+from mappo_unity.scenes.factory import call_factory, explain_error, load_factory  # noqa: E402
+from mappo_unity.scenes.user_env import GuardedEnv  # noqa: E402
 
 MakeEnv = Callable[[int], BaseEnv]
 
-EDITOR_PORT = 5004
-"""Port on which Unity's Editor looks for a trainer."""
 PLAYER_STRIDE = 100_003
 """Player n of several starts from the seed plus n times this (modulo 2^31)."""
-OUR_FRAMES = (
-    "<frozen importlib",
-    str(Path(inspect.getfile(importlib)).parent),
-    str(Path(__file__).parents[1]),
-)
-"""Beginnings of file names in a traceback that say nothing about a user's code."""
 
 
 def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv:
@@ -165,77 +155,3 @@ def _custom(cfg: EnvConfig) -> MakeEnv:
     name = f"env.factory={cfg.factory}"
     factory = load_factory(str(cfg.factory), name)
     return lambda seed: GuardedEnv(call_factory(factory, name, seed, cfg.params), name, explain_error)
-
-
-def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapping[str, Any]) -> BaseEnv:
-    """Return a user's environment.
-
-    Raises:
-        ConfigError: the factory does not take the parameters, raised something (its `details` are the user's
-            frames of the traceback), or returned no BaseEnv. ConfigError and EnvironmentFailure of its own
-            pass.
-    """
-    check_call(factory, name, params)
-    try:
-        env = factory(seed=seed, **params)
-    except (ConfigError, EnvironmentFailure):
-        raise
-    except Exception as error:
-        raise explain_error(error, name) from error
-    if not isinstance(env, BaseEnv):
-        raise ConfigError(
-            f"{name} returned {with_article(type(env).__name__)}; it must return a "
-            "mlagents_envs.base_env.BaseEnv"
-        )
-    return env
-
-
-def check_call(factory: Callable[..., Any], name: str, params: Mapping[str, Any]) -> None:
-    """Raise ConfigError if a factory does not take these parameters, as far as its signature says."""
-    try:
-        signature = inspect.signature(factory)
-    except (TypeError, ValueError):
-        return  # a builtin without one
-    try:
-        signature.bind(seed=0, **params)
-    except TypeError as error:
-        raise ConfigError(
-            f"{name} cannot be called with seed and {', '.join(params) or 'nothing else'}: {error}; it is "
-            f"{getattr(factory, '__name__', 'function')}{signature}"
-        ) from error
-
-
-def load_factory(path: str, name: str) -> Callable[..., Any]:
-    """Return the function that package.module:function names; raises ConfigError, which calls it `name`."""
-    module_name, _, function_name = path.partition(":")
-    if str(Path.cwd()) not in sys.path:  # as `python -m` does: modules beside the user count
-        sys.path.insert(0, str(Path.cwd()))
-    try:
-        module = importlib.import_module(module_name)
-    except Exception as error:  # the user's module raises what it likes
-        raise explain_error(error, f"{name}: module {module_name!r} cannot be imported: it") from error
-    function = getattr(module, function_name, None)
-    if not callable(function):
-        names = sorted(n for n, v in vars(module).items() if callable(v) and not n.startswith("_"))
-        hint = did_you_mean(function_name, names)
-        more = ", ..." if len(names) > 20 else ""
-        raise ConfigError(
-            f"{name}: {module_name} has no function {function_name!r}{hint}; it has "
-            f"{', '.join(names[:20]) or 'none'}{more}"
-        )
-    return function
-
-
-def explain_error(error: BaseException, who: str) -> ConfigError:
-    """Return the mistake "`who` raised ..." with the traceback of the user's code, without our frames."""
-    text = str(error).strip()
-    mistake = ConfigError(
-        f"{who} raised {type(error).__name__}" + (f": {' '.join(text.split())}" if text else "")
-    )
-    report = TracebackException.from_exception(error)
-    part: TracebackException | None = report
-    while part is not None:
-        part.stack[:] = [frame for frame in part.stack if not frame.filename.startswith(OUR_FRAMES)]
-        part = part.__cause__ or part.__context__
-    mistake.details = tuple("".join(report.format()).splitlines())
-    return mistake

@@ -12,9 +12,9 @@ from typing import NamedTuple
 from mlagents_envs.base_env import BaseEnv, BehaviorSpec, DecisionSteps, TerminalSteps
 
 from mappo_unity import keys
-from mappo_unity.envs.contract import EnvironmentDataError, check_specs, note_silence
-from mappo_unity.envs.record_check import RecordCheck
 from mappo_unity.envs.slots import count_teams
+from mappo_unity.scenes.contract.records import RecordCheck
+from mappo_unity.scenes.contract.rules import EnvironmentDataError, check_specs, note_silence
 
 
 class First(NamedTuple):

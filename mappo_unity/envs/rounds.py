@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps
 
-from mappo_unity.envs.contract import EnvironmentDataError as EnvironmentDataError
 from mappo_unity.envs.slots import SlotTable
+from mappo_unity.scenes.contract.rules import EnvironmentDataError as EnvironmentDataError
 
 
 class Episode(NamedTuple):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 FREE = -(2**62)  # no agent id, no team key
 

@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import CatTensors, Compose, ExcludeTransform, Stack, Transform, TransformedEnv
 
 from mappo_unity import keys
-from mappo_unity.config.schema import ConfigError
 from mappo_unity.envs.unity_env import UnityEnv, unchecked
+from mappo_unity.errors import ConfigError
 
 
 def make_transforms(env: UnityEnv) -> Compose:

@@ -22,18 +22,18 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from mappo_unity import keys
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.envs.contract import (
+from mappo_unity.envs.opening import first_results, team_sizes
+from mappo_unity.envs.rounds import BehaviorRounds, Episode
+from mappo_unity.envs.slots import SlotTable
+from mappo_unity.envs.specs import make_specs
+from mappo_unity.errors import ConfigError
+from mappo_unity.scenes.contract.rules import (
     MAX_SILENT_STEPS,
     check_plain,
     check_same_specs,
     note_silence,
     silence_error,
 )
-from mappo_unity.envs.opening import first_results, team_sizes
-from mappo_unity.envs.rounds import BehaviorRounds, Episode
-from mappo_unity.envs.slots import SlotTable
-from mappo_unity.envs.specs import make_specs
 
 
 class CutOff(NamedTuple):

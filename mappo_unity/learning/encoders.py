@@ -15,7 +15,7 @@ from mlagents_envs.base_env import ObservationSpec
 from torch import Tensor, nn
 
 from mappo_unity import keys
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 OBS_CLIP = 5.0  # ML-Agents clips normalised observations to +-5
 IMAGE_FEATURES = 128

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
-from mappo_unity.config.schema import EnvironmentFailure
-from mappo_unity.envs.contract import MAX_SILENT_STEPS, check_specs, note_silence, silence_error
-from mappo_unity.envs.record_check import RecordCheck
 from mappo_unity.envs.rounds import Episode
+from mappo_unity.errors import EnvironmentFailure
 from mappo_unity.policies.policy import Policy
+from mappo_unity.scenes.contract.records import RecordCheck
+from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_specs, note_silence, silence_error
 
 MAX_ENV_STEPS = 5_000_000
 NUM_BATCHES = 40  # of consecutive episodes, at most

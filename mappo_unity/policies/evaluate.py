@@ -10,13 +10,13 @@ from typing import Any
 
 import torch
 
-from mappo_unity.config.compose import config_to_play
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.episodes import play, summarize
 from mappo_unity.policies.matches import Score, play_matches
 from mappo_unity.policies.onnx_policy import OnnxFolder, OnnxPolicy
 from mappo_unity.policies.policy import CheckpointPolicy, Policy, RandomPolicy
 from mappo_unity.policies.policy_files import Kind, choose_checkpoint, locate
+from mappo_unity.runs.options import config_to_play
 
 
 def evaluate(

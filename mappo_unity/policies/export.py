@@ -19,13 +19,13 @@ from tensordict import TensorDictBase
 
 from mappo_unity import keys
 from mappo_unity.config.packages import ExportError
-from mappo_unity.interrupts import interrupts_wait
 from mappo_unity.policies.onnx_check import compare
 from mappo_unity.policies.onnx_graph import build_model
 from mappo_unity.policies.onnx_policy import SUFFIX, file_name
 from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.signals import interrupts_wait
 
 SAMPLE_ROWS = 64  # observations that a checkpoint keeps of each policy
 PAUSE_S = 10.0  # least time between two exports of the best checkpoint of a run

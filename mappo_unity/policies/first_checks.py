@@ -14,25 +14,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.config.compose import check_factory, config_to_play
 from mappo_unity.config.presets import group_choices
-from mappo_unity.config.schema import (
-    Backend,
-    Config,
-    ConfigError,
-    EnvConfig,
-    EvalConfig,
-    ExportConfig,
-    PlayConfig,
-)
+from mappo_unity.config.schema import Backend, Config, EnvConfig, EvalConfig, ExportConfig, PlayConfig
 from mappo_unity.envs.backends import EDITOR_PORT, find_player, make_env_function
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.layouts import check_layout, check_two_sides
 from mappo_unity.policies.onnx_policy import OnnxFolder, OnnxPolicy
 from mappo_unity.policies.policy_files import SUFFIX, Kind, Source, check_checkpoint, check_resumable, locate
-from mappo_unity.policies.screens import check_mujoco
 from mappo_unity.protocol.ports import check_port
 from mappo_unity.runs.folder import CONFIG, find_run
+from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes import scene_names
+from mappo_unity.scenes.factory import check_factory
+from mappo_unity.scenes.mujoco_check import check_mujoco
 
 _FILE_ENDING = re.compile(
     rf"\.(?!{SUFFIX[1:]}$)[A-Za-z][A-Za-z0-9]{{0,3}}"
@@ -105,7 +99,7 @@ def check_out(out: str) -> None:
 def check_environment(config: Config) -> None:
     """Raise ConfigError if the environment of a run cannot be opened: no such factory, player or port."""
     check_mujoco()  # torchrl loads it, whatever the environment is
-    check_factory(config)
+    check_factory(config.env)
     if config.env.backend is Backend.player:
         find_player(config.env)
     if config.env.backend is Backend.editor:

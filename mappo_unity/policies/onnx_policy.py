@@ -19,7 +19,7 @@ from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps
 
 from mappo_unity import keys
 from mappo_unity.config.packages import import_package
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.policy_files import SUFFIX
 
 

@@ -16,7 +16,8 @@ from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity import keys
-from mappo_unity.config.schema import Activation, ConfigError, CriticKind, ModelConfig
+from mappo_unity.config.schema import Activation, CriticKind, ModelConfig
+from mappo_unity.errors import ConfigError
 from mappo_unity.learning.actor_critic import make_actor
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout

@@ -14,7 +14,7 @@ from enum import Enum
 from pathlib import Path
 
 from mappo_unity.config.overrides import shell_argument
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.checkpoint_file import (
     BEST,
     FOLDER,

@@ -23,7 +23,7 @@ from mlagents_envs.side_channel.engine_configuration_channel import EngineConfig
 from mlagents_envs.side_channel.environment_parameters_channel import EnvironmentParametersChannel
 from mlagents_envs.side_channel.side_channel_manager import SideChannelManager
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.decode import ActionEncoder, BehaviorDecoder, MalformedMessage, behavior_spec
 from mappo_unity.protocol.messages import STATUS_OK

@@ -11,7 +11,7 @@ import sys
 from argparse import Namespace
 from pathlib import Path
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 
 def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
@@ -24,7 +24,7 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
         raise ConfigError(f"build takes a scene and a folder, not {' '.join(rest)}")
     name = scene.rpartition(":")[2] or scene
     path = _executable(Path(folder), name)
-    command = [sys.executable, "-m", "mappo_unity.protocol.serve", scene]
+    command = [sys.executable, "-m", "mappo_unity.player", scene]
     if options.num_areas is not None:
         command += ["--num-areas", str(options.num_areas)]
     for parameter in options.param:

@@ -11,7 +11,7 @@ import sys
 import time
 from types import TracebackType
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 
 class PlayerLog:

@@ -10,9 +10,11 @@ import errno
 import os
 import socket
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 ADDRESS = "127.0.0.1"
+EDITOR_PORT = 5004
+"""Port on which Unity's Editor looks for a trainer, and a trainer waits for it."""
 FREE, LINGERS, TAKEN, FORBIDDEN = "free", "TIME_WAIT", "in use", "forbidden"
 
 

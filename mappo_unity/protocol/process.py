@@ -19,7 +19,7 @@ from functools import cache
 from pathlib import Path
 
 from mappo_unity.config.overrides import shell_word
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 _DIE_WITH_PARENT = """
 import ctypes, os, sys

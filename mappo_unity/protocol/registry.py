@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.process import find_executable
 
 _URLS = {"darwin": "_darwin_url", "win32": "_win_url"}

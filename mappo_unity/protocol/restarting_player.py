@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 
-from mappo_unity.config.schema import ConfigError, EnvironmentFailure
+from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.protocol.client import MakePlayer, PlayerFailure, UnityPlayer
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0

@@ -1,4 +1,4 @@
-"""mappo-player: serve a scene as if it were a built Unity player.
+"""Serve a scene as if it were a built Unity player.
 
 In: a scene's name (or package.module:function) and the arguments that ML-Agents passes to players. Out: the
 gRPC client's side of the ML-Agents protocol (API 1.5.0) on a port of this machine, until the trainer closes
@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import re
 import socket
-import sys
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.protobuf import install
 
 install()
@@ -27,9 +26,7 @@ from mappo_unity import __version__  # noqa: E402
 from mappo_unity.config.option_table import did_you_mean  # noqa: E402
 from mappo_unity.protocol import encode, messages, side_channels  # noqa: E402
 from mappo_unity.protocol.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
-from mappo_unity.protocol.player_build import build  # noqa: E402
-from mappo_unity.protocol.player_log import PlayerLog  # noqa: E402
-from mappo_unity.protocol.player_options import EDITOR_PORT, check_build, parse  # noqa: E402
+from mappo_unity.protocol.ports import EDITOR_PORT  # noqa: E402
 
 CONNECT_TIMEOUT_S = 60.0
 """How long a player looks for its trainer."""
@@ -46,29 +43,6 @@ class PlayerError(RuntimeError):
     """The trainer asked for something that cannot be done."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run mappo-player; return the exit code: 0 when the trainer closed, 1 after an error, 2 for a mistake.
-
-    Raises:
-        ConfigError: a mistake in the options.
-    """
-    known, ignored = parse(sys.argv[1:] if arguments is None else arguments)
-    if known.scene == "build":
-        check_build(known, ignored)
-        env_function(ignored[0], known.num_areas, known.params)(
-            0, None
-        ).close()  # it starts with these options
-        print(build(ignored[0], ignored[1], ignored[2:], known))
-        return 0
-    make_env = env_function(known.scene, known.num_areas, known.params)
-    port = EDITOR_PORT if known.port is None else known.port
-    with PlayerLog(known.log_file) as log:
-        log(f"mappo-player {__version__}: {known.scene}, port {port}, protocol {messages.API_VERSION}")
-        if ignored:
-            log(f"accepted and without effect: {' '.join(ignored)}")
-        return serve(Player(make_env, known.scene, log, png=not known.no_png), port, log)
-
-
 def env_function(scene: str, num_areas: int | None = None, params: dict[str, float] | None = None) -> MakeEnv:
     """Return the function (seed, number of areas or None) -> BaseEnv of a scene or a factory.
 
@@ -79,7 +53,7 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
     if "seed" in fixed:
         raise ConfigError("--param seed: the seed is the trainer's to choose")
     if re.fullmatch(r"[\w.]+:\w+", scene):
-        from mappo_unity.envs.backends import call_factory, check_call, load_factory
+        from mappo_unity.scenes.factory import call_factory, check_call, load_factory
 
         factory = load_factory(scene, scene)
         check_call(factory, scene, fixed)
@@ -269,11 +243,3 @@ def _say_goodbye(exchange: Callable[..., bytes], text: str) -> None:
         exchange(messages.message(STATUS_QUIT, text=text), timeout=5)
     except grpc.RpcError:
         pass  # nobody is there to hear it
-
-
-if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except ConfigError as mistake:
-        print(f"mappo-player: {mistake}", *mistake.details, sep="\n", file=sys.stderr)
-        sys.exit(2)

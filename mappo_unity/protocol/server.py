@@ -15,7 +15,7 @@ from typing import Any
 
 import grpc
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.messages import METHOD, OPTIONS, STATUS_QUIT, message
 from mappo_unity.protocol.ports import ADDRESS, check_port
 

@@ -14,7 +14,7 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 FORMAT = 2
 FOLDER = "checkpoints"

@@ -23,10 +23,11 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from mappo_unity.config.overrides import shell_argument
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
+from mappo_unity.config.user_modules import folder_of
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.lock import LOCK
-from mappo_unity.user_modules import folder_of
 
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
 RECORD = (CONFIG, OVERRIDES, VERSIONS)

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 LOCK = ".lock"
 _FAR = 1 << 30  # Windows locks bytes, which nobody may read meanwhile: one far behind the text

@@ -22,7 +22,8 @@ from rich.console import Console
 
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.overrides import shell_argument
-from mappo_unity.config.schema import ConfigError, LogBackend, LogConfig
+from mappo_unity.config.schema import LogBackend, LogConfig
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.metrics_csv import STEP, MetricsFile, keep_until, read_metrics
 from mappo_unity.runs.progress import Progress, current_job
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.interrupts import interrupts_wait
-from mappo_unity.policies.screens import check_mujoco
+from mappo_unity.errors import ConfigError
+from mappo_unity.scenes.mujoco_check import check_mujoco
+from mappo_unity.signals import interrupts_wait
 
 if TYPE_CHECKING:
     from mlagents_envs.base_env import BaseEnv

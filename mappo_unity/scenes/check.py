@@ -1,6 +1,6 @@
 """Check a scene or any BaseEnv: ``python -m mappo_unity.scenes.check NAME``; see `core.contract`."""
 
-from mappo_unity.scenes.core.contract import main
+from mappo_unity.scenes.contract.check import main
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -20,7 +20,8 @@ from mappo_unity.config.behavior_lines import readable_lines
 from mappo_unity.config.compose import Composed, check_effect, compose_config, to_config
 from mappo_unity.config.overrides import check_overrides, given, parse, range_length
 from mappo_unity.config.presets import group_choices
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.first_checks import check_environment
 
 MANY = 200  # jobs whose check takes so long that it is announced

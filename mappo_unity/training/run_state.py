@@ -14,7 +14,8 @@ import torch
 from tensordict import TensorDictBase
 
 from mappo_unity.config.per_behavior import behavior_config
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import sample_inputs
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import get_rng_state, set_rng_state

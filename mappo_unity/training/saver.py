@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from mappo_unity.config.overrides import shell_argument
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
 from mappo_unity.runs import checkpoint
 from mappo_unity.training.run_state import RunState

@@ -18,10 +18,11 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType
 
 from mappo_unity.config.per_behavior import behavior_config, check_behaviors
-from mappo_unity.config.schema import CollectConfig, Config, ConfigError, ModelConfig, PPOConfig
+from mappo_unity.config.schema import CollectConfig, Config, ModelConfig, PPOConfig
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.errors import ConfigError
 from mappo_unity.learning.actor_critic import JointPolicy, make_actor, make_critic
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout

@@ -13,9 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from mappo_unity.interrupts import handled
-from mappo_unity.stopping import ECHO_S
-from mappo_unity.termination import Interrupted
+from mappo_unity.signals import DUPLICATE_SIGNAL_S, Interrupted, handled
 
 PATIENCE_S = 5.0  # after a signal, before the iteration is given up
 
@@ -58,7 +56,7 @@ class StopSignals:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.signal is not None:
-            if time.monotonic() - self._came_s > ECHO_S:
+            if time.monotonic() - self._came_s > DUPLICATE_SIGNAL_S:
                 raise Interrupted(self.signal)
             return
 

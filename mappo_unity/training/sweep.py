@@ -23,19 +23,25 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from mappo_unity.config.behavior_lines import dotted_options, readable_lines
-from mappo_unity.config.compose import check_factory, register_root, to_config
+from mappo_unity.config.compose import register_root, to_config
 from mappo_unity.config.overrides import given, open_line, parse
 from mappo_unity.config.presets import conf_dir
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
 from mappo_unity.config.text_lines import quoted_path
-from mappo_unity.interrupts import interrupts_wait
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.folder import NewFolder, create_folder, discard_folder, write_record
 from mappo_unity.runs.lock import locked
 from mappo_unity.runs.progress import job_of_sweep
-from mappo_unity.stopping import Patience, in_process_of_its_own, job_signals, sweep_signals
-from mappo_unity.termination import Interrupted
+from mappo_unity.scenes.factory import check_factory
+from mappo_unity.signals import Interrupted, interrupts_wait
 from mappo_unity.training.plan import Plan, plan_jobs
+from mappo_unity.training.sweep_signals import (
+    SweepSignalHandler,
+    in_process_of_its_own,
+    job_signals,
+    sweep_signals,
+)
 
 RESULT = "result.json"
 GOOD = ("finished", "solved")
@@ -80,7 +86,7 @@ def run_sweep(lines: list[str], file: Path | None = None) -> SweepResult:
     """
     plan = plan_jobs(lines, file, lambda text: print(text, flush=True))
     folder = _sweep_folder(lines, plan)
-    result, patience = SweepResult(folder.path), Patience()
+    result, patience = SweepResult(folder.path), SweepSignalHandler()
     try:
         with sweep_signals(patience, parallel=given(lines, "hydra/launcher") == "joblib"):
             _launch(
@@ -157,7 +163,7 @@ def job_options(job: JobResult) -> dict[str, str]:
 
 def _train(config: Config, folder: Path, result: JobResult) -> int | None:
     write_record(folder, config, result.overrides)
-    check_factory(config)
+    check_factory(config.env)
     with interrupts_wait():
         from mappo_unity.training.trainer import train
 

@@ -11,12 +11,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from rich.console import Console
 from tensordict import TensorDictBase
 
-from mappo_unity.config.schema import Config, ConfigError
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
 from mappo_unity.runs.logger import RunLog
-from mappo_unity.termination import Interrupted
+from mappo_unity.signals import Interrupted
 from mappo_unity.training.episode_stats import by_policy
 from mappo_unity.training.memory import is_out_of_memory
 from mappo_unity.training.outcome import DIVERGED, FINISHED, INTERRUPTED, SOLVED, Outcome, why_over
@@ -32,7 +34,11 @@ AfterIteration = Callable[[RunState], "str | None"]
 
 
 def train(
-    cfg: Config, folder: Path, resume_from: Path | None = None, after_iteration: AfterIteration | None = None
+    cfg: Config,
+    folder: Path,
+    resume_from: Path | None = None,
+    after_iteration: AfterIteration | None = None,
+    console: Console | None = None,
 ) -> Outcome:
     """Train to the end of the run, from a checkpoint where one is given.
 
@@ -43,6 +49,7 @@ def train(
         folder: the run's folder.
         resume_from: a checkpoint of this run.
         after_iteration: see `AfterIteration`.
+        console: where progress and messages go; None: standard output.
 
     Raises:
         ConfigError: options, checkpoint and environment do not fit together, or memory ran out.
@@ -55,7 +62,7 @@ def train(
             state.load(resume_from)
 
         resume_steps = state.agent_steps if resume_from is not None else None
-        with RunLog(cfg.log, folder, cfg.max_steps, resume_steps) as log:
+        with RunLog(cfg.log, folder, cfg.max_steps, resume_steps, console) as log:
             # not before: until here something may be refused
             log.message(f"run folder: {folder}" if resume_from is None else f"continuing from {resume_from}")
             for note in setup.notes:

@@ -8,7 +8,7 @@ from mlagents_envs.base_env import ActionTuple
 
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.basic.scene import Basic
-from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.contract.check import check_env
 
 NAME = "Basic?team=0"
 STAY, LEFT, RIGHT = 0, 1, 2

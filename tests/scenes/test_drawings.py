@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.scenes import make_scene, scene_names
 from mappo_unity.scenes.core.shapes import (

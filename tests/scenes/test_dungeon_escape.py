@@ -13,7 +13,7 @@ import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.scenes.dungeon_escape.layout import DRAGON, KEY, TOMB
 from mappo_unity.scenes.dungeon_escape.scene import DungeonEscape
 

@@ -9,7 +9,7 @@ import pytest
 from mlagents_envs.base_env import ActionTuple, DimensionProperty
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.scenes.grid_food_collector.scene import (
     AGENT,
     BAD_FOOD,

@@ -12,7 +12,7 @@ import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.scenes.hallway.scene import Hallway
 
 NAME = "Hallway?team=0"

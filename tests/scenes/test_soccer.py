@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.scenes.soccer.scene import SoccerScene
 
 PURPLE, BLUE = "SoccerTwos?team=1", "SoccerTwos?team=0"

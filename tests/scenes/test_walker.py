@@ -18,9 +18,9 @@ from walker_figures import (
     posed,
 )
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.scenes.walker import body
 from mappo_unity.scenes.walker.scene import Walker
 

@@ -10,7 +10,7 @@ import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.scenes import make_scene
-from mappo_unity.scenes.core.contract import check_env
+from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.scenes.wall_jump.scene import NOTHING_PENDING, WallJump
 
 SMALL, BIG = "SmallWallJump?team=0", "BigWallJump?team=0"

@@ -19,7 +19,7 @@ from mlagents_envs.base_env import (
 )
 from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.core.action_check import ActionCheck
 from mappo_unity.scenes.core.agents import Agents
 from mappo_unity.scenes.core.hooks import SceneHooks

@@ -20,7 +20,7 @@ from mlagents_envs.base_env import (
     ObservationType,
 )
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.core.shapes import Drawing
 
 DRAWINGS = {

@@ -12,20 +12,20 @@ from typing import Any, Protocol
 
 import torch
 
-from mappo_unity.config.compose import config_to_play
 from mappo_unity.config.schema import PlayConfig
 from mappo_unity.envs.backends import make_env_function
-from mappo_unity.policies.camera import MovingCamera
-from mappo_unity.policies.caption import Tally
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.policies.first_checks import check_embedded
 from mappo_unity.policies.policy import Policy
-from mappo_unity.policies.video import VideoFile, check_video
-from mappo_unity.policies.window import Window
+from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes.core.scene import Scene
 from mappo_unity.scenes.core.shapes import Camera, Drawing, Follow, Shape
 from mappo_unity.scenes.drawings import drawing_of
-from mappo_unity.termination import termination_as_interrupt
+from mappo_unity.signals import termination_as_interrupt
+from mappo_unity.viewing.camera import MovingCamera
+from mappo_unity.viewing.caption import Tally
+from mappo_unity.viewing.video import VideoFile, check_video
+from mappo_unity.viewing.window import Window
 
 FRAMES_PER_S = 30  # about: a frame shows a whole number of ticks
 RANDOM = "random"

@@ -1,7 +1,8 @@
-"""Signals during a block: who takes them, and Ctrl-C while a command starts.
+"""SIGINT and SIGTERM: who takes them during a block, and how they become exceptions.
 
-In: a block, such as one of imports and reading of options. Out: the interrupt, after the block. Extension
-modules (NumPy, torch, MuJoCo) lose an interrupt that arrives while they are loaded, or are left half loaded.
+In: a block, such as one of imports and reading of options. Out: the interrupt, in the block or after it.
+Extension modules (NumPy, torch, MuJoCo) lose an interrupt that arrives while they are loaded, or are left
+half loaded. How a training run and a sweep end is theirs: `training.stop_signals`, `training.sweep_signals`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
+
+DUPLICATE_SIGNAL_S = 0.5
+"""The same signal, once to the process and once to its group, is one; a second one comes later."""
 
 
 @contextmanager
@@ -60,3 +64,22 @@ def interrupts_wait() -> Iterator[None]:
             if not callable(waiting):
                 raise KeyboardInterrupt
             waiting(came[0], None)
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal ended the work; ``signal`` is its number."""
+
+    def __init__(self, number: int = signal.SIGINT) -> None:
+        super().__init__(number)
+        self.signal = int(number)
+
+
+@contextmanager
+def termination_as_interrupt() -> Iterator[None]:
+    """Let SIGTERM end the block as Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise Interrupted(number)
+
+    with handled(interrupt, signal.SIGTERM):
+        yield

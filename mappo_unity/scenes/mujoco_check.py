@@ -1,29 +1,11 @@
-"""Whether a video can be drawn and written, or a window be opened, here: asked before torch is loaded.
-
-In: `PlayConfig` and what the system has. Out: nothing, or a `ConfigError` that names what is missing.
-"""
+"""Whether MuJoCo can be loaded here, asked where a plain import would end in a traceback."""
 
 from __future__ import annotations
 
 import importlib
 import os
-from pathlib import Path
 
-from mappo_unity.config.schema import ConfigError, PlayConfig
-
-
-def check_screen(cfg: PlayConfig) -> None:
-    """Raise ConfigError if the video cannot be written or drawn, or no window can be opened."""
-    check_mujoco()
-    if cfg.video is None:
-        from mappo_unity.policies.window import check_display
-
-        return check_display()
-    from mappo_unity.policies.render import check_opengl
-    from mappo_unity.policies.video import check_video
-
-    check_video(Path(cfg.video))
-    check_opengl()
+from mappo_unity.errors import ConfigError
 
 
 def check_mujoco() -> None:

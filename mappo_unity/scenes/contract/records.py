@@ -12,7 +12,7 @@ from typing import Any, NoReturn, TypeAlias
 import numpy as np
 from mlagents_envs.base_env import BehaviorSpec, DecisionSteps, TerminalSteps
 
-from mappo_unity.envs.contract import LISTS, EnvironmentDataError, sensor_name, show_kind
+from mappo_unity.scenes.contract.rules import LISTS, EnvironmentDataError, sensor_name, show_kind
 
 FLOAT32, BOOL = np.dtype(np.float32), np.dtype(bool)
 

@@ -10,7 +10,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 
 def add_working_directory() -> None:

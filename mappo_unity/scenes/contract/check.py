@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
-from mappo_unity.cli.arguments import check_range
-from mappo_unity.config.schema import ConfigError, EnvironmentFailure
-from mappo_unity.envs.backends import call_factory, explain_error, load_factory
-from mappo_unity.envs.contract import ContractError, check_plain, check_specs
-from mappo_unity.envs.record_check import RecordCheck
-from mappo_unity.envs.user_env import GuardedEnv
+from mappo_unity.config.ranges import check_range
+from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.scenes import make_scene, scene_names
-from mappo_unity.scenes.core.checked_play import Report, Trace, play
-from mappo_unity.scenes.core.checked_play import random_actions as random_actions
-from mappo_unity.scenes.core.lifecycle import require
+from mappo_unity.scenes.contract.lifecycle import require
+from mappo_unity.scenes.contract.play import Report, Trace, play
+from mappo_unity.scenes.contract.play import random_actions as random_actions
+from mappo_unity.scenes.contract.records import RecordCheck
+from mappo_unity.scenes.contract.rules import ContractError, check_plain, check_specs
+from mappo_unity.scenes.factory import call_factory, explain_error, load_factory
+from mappo_unity.scenes.user_env import GuardedEnv
 
 
 def check_env(

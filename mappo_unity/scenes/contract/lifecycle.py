@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from mlagents_envs.base_env import DecisionSteps, TerminalSteps
 
-from mappo_unity.envs.contract import ContractError
+from mappo_unity.scenes.contract.rules import ContractError
 
 
 @dataclass

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import ActionSpec, BehaviorSpec, ObservationSpec
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 MAX_SILENT_STEPS = 100_000  # BaseEnv steps in a row in which nobody asks before that is called an error
 SILENCE_NOTED = 1_000  # steps in a row after which it is said

@@ -18,9 +18,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.policies.antialias import smooth_edges
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.core.shapes import Camera, Kind, Shape
+from mappo_unity.viewing.antialias import smooth_edges
 
 PACKAGES = (
     "on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri (EGL), or libosmesa6 with MUJOCO_GL=osmesa"

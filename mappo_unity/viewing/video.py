@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.config.extras import install_command
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.policies.caption import draw_caption
-from mappo_unity.policies.render import Renderer
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.core.shapes import Camera, Shape
+from mappo_unity.viewing.caption import draw_caption
+from mappo_unity.viewing.render import Renderer
 
 SUFFIXES = (".mp4", ".gif")
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 
-from mappo_unity.config.schema import ConfigError, EnvironmentFailure
+from mappo_unity.errors import ConfigError, EnvironmentFailure
 
 Result = TypeVar("Result")
 

@@ -12,9 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps
 
-from mappo_unity.envs.contract import ContractError, check_same_specs
-from mappo_unity.envs.record_check import RecordCheck, Repair
-from mappo_unity.scenes.core.lifecycle import Lives, require
+from mappo_unity.scenes.contract.lifecycle import Lives, require
+from mappo_unity.scenes.contract.records import RecordCheck, Repair
+from mappo_unity.scenes.contract.rules import ContractError, check_same_specs
 
 Trace: TypeAlias = "list[tuple[str, np.ndarray]]"  # what was sent: name and copy of each array
 

@@ -17,14 +17,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from mappo_unity.interrupts import handled
-from mappo_unity.termination import Interrupted, termination_as_interrupt
+from mappo_unity.signals import DUPLICATE_SIGNAL_S, Interrupted, handled, termination_as_interrupt
 
 GRACE_S = 30.0
-ECHO_S = 0.5  # the same signal, once to the process and once to its group, is one; a second one comes later
 
 
-class Patience:
+class SweepSignalHandler:
     """Handle the signals of the process that started the jobs: the first makes it wait, a second ends it."""
 
     def __init__(self) -> None:
@@ -35,7 +33,7 @@ class Patience:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Take a signal; raises Interrupted for the second one, or GRACE_S after the first."""
         if self.number is not None:
-            if time.monotonic() - self._since_s > ECHO_S:
+            if time.monotonic() - self._since_s > DUPLICATE_SIGNAL_S:
                 raise Interrupted(self.number)
             return
         self.number, self._since_s = number, time.monotonic()
@@ -62,7 +60,7 @@ def _hand_on(number: int) -> None:
             os.kill(child.pid, number)  # type: ignore[arg-type]
 
 
-_sweep: Patience | None = None  # in the process of the sweep; None in those of its jobs
+_sweep: SweepSignalHandler | None = None  # in the process of the sweep; None in those of its jobs
 
 
 def in_process_of_its_own() -> bool:
@@ -71,7 +69,7 @@ def in_process_of_its_own() -> bool:
 
 
 @contextmanager
-def sweep_signals(patience: Patience, parallel: bool) -> Iterator[None]:
+def sweep_signals(patience: SweepSignalHandler, parallel: bool) -> Iterator[None]:
     """Between jobs, let SIGTERM end a sweep as Ctrl-C does: with its table and its exit code.
 
     With `parallel` (jobs in processes of their own) both wait for the jobs, as `patience` does.
@@ -86,7 +84,7 @@ def sweep_signals(patience: Patience, parallel: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _waiting(patience: Patience) -> Iterator[None]:
+def _waiting(patience: SweepSignalHandler) -> Iterator[None]:
     with handled(patience, signal.SIGINT, signal.SIGTERM):
         try:
             yield

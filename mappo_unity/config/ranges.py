@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from mappo_unity.config.schema import ConfigError
+from mappo_unity.errors import ConfigError
 
 
 def check_range(name: str, value: int, low: int, high: int | None = None) -> None:

@@ -14,9 +14,9 @@ from typing import Any
 
 import mujoco
 
-from mappo_unity.config.schema import ConfigError
-from mappo_unity.policies.render import Stage
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.core.shapes import Camera, Shape
+from mappo_unity.viewing.render import Stage
 
 NO_WINDOW = "no window can be opened on the display; video=FILE.mp4 or .gif writes a video"
 

@@ -9,12 +9,10 @@ import argparse
 import math
 from collections.abc import Sequence
 
-from mappo_unity.cli.arguments import check_range
 from mappo_unity.cli.switches import Once, Parser, whole_number
-from mappo_unity.config.schema import ConfigError
-
-EDITOR_PORT = 5004
-"""Port on which a trainer waits for the Editor, used when no --mlagents-port is given."""
+from mappo_unity.config.ranges import check_range
+from mappo_unity.errors import ConfigError
+from mappo_unity.protocol.ports import EDITOR_PORT
 
 
 def parse(lines: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:

@@ -1,0 +1,36 @@
+"""mappo-eval: play episodes, or matches, with a trained policy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mappo_unity.config.schema import EvalConfig
+from mappo_unity.signals import interrupts_end
+
+
+def help_text() -> str:
+    """Return the text of --help."""
+    from mappo_unity.cli.help import eval_help
+
+    return eval_help(EvalConfig)
+
+
+def run(lines: list[str]) -> int:
+    """Play; print a table and one line of JSON; return the exit code."""
+    with interrupts_end("mappo-eval"):
+        from mappo_unity.config.compose import compose_plain
+        from mappo_unity.policies.first_checks import check_evaluation
+
+        config = compose_plain(lines, EvalConfig)
+        check_evaluation(config)
+        options = vars(config)
+        where = Path(options.pop("run"))
+        from mappo_unity.policies.evaluate import evaluate
+
+    result: dict[str, Any] = evaluate(where, **options)
+    from mappo_unity.cli import report
+
+    report.console().print(report.eval_table(result))
+    print(report.json_line(result))
+    return 0

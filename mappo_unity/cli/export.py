@@ -1,0 +1,35 @@
+"""mappo-export: write a trained policy as ONNX files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mappo_unity.config.schema import ExportConfig
+from mappo_unity.signals import interrupts_end
+
+
+def help_text() -> str:
+    """Return the text of --help."""
+    from mappo_unity.cli.help import export_help
+
+    return export_help(ExportConfig)
+
+
+def run(lines: list[str]) -> int:
+    """Export the policy; return the exit code."""
+    with interrupts_end("mappo-export"):
+        from mappo_unity.config.compose import compose_plain
+        from mappo_unity.policies.first_checks import check_export
+        from mappo_unity.policies.policy_files import choose_checkpoint
+
+        options = compose_plain(lines, ExportConfig)
+        check_export(options)
+        from mappo_unity.policies.export import export_checkpoint
+
+    checkpoint = choose_checkpoint(Path(options.run))
+    for file in export_checkpoint(checkpoint, Path(options.out) if options.out else None):
+        print(
+            f"{file.path}: {file.policy} after {file.agent_steps:,} agent steps; plays as {checkpoint} does "
+            f"(on {file.rows} observations: actions to {file.error:.1e}, samples in distribution)"
+        )
+    return 0

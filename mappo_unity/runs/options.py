@@ -1,0 +1,69 @@
+"""The options of a run that is there: to resume it, or to play what was trained in it.
+
+In: a run folder, override lines. Out: a checked `Config`, or a `ConfigError`. The module of env.factory may
+lie where the run found it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mappo_unity.config.compose import check_effect, compose_config, load_config
+from mappo_unity.config.overrides import given, parse
+from mappo_unity.config.presets import group_choices
+from mappo_unity.config.schema import Config
+from mappo_unity.config.text_lines import quoted
+from mappo_unity.config.user_modules import look_in
+from mappo_unity.errors import ConfigError
+from mappo_unity.runs.folder import CONFIG, factory_folder, find_run
+
+
+def compose_resumed(lines: list[str], base: Path) -> Config:
+    """Compose the options of a run that goes on: its config.yaml, then overrides; raise ConfigError.
+
+    What says which run it is (env, env.name, the folders) cannot be overridden.
+    """
+    saved = load_config(base)
+    chosen = given(lines, "env")
+    if chosen is not None and chosen != saved.env.name:
+        raise ConfigError(
+            f"env={chosen} differs from the run's env={saved.env.name}: a run goes on in its own env; "
+            "leave env out, or start a new run without resume"
+        )
+    rest = [line for line in lines if parse([line])[0].key_or_group != "env"]
+    for key in ("env.name", "output_dir", "hydra.run.dir"):
+        if given(rest, key) is not None:
+            raise ConfigError(
+                f"{key} cannot change with resume: the run goes on in its own folder {base.parent}"
+            )
+    config = compose_config(rest, base).config
+    if config.seed != saved.seed:
+        raise ConfigError(
+            f"seed={config.seed} cannot change with resume: the run has seed={saved.seed}, and its random "
+            "numbers go on where they were; leave seed out, or start a new run without resume"
+        )
+    check_effect(rest, [config])
+    if config.env.factory is not None:
+        look_in(factory_folder(base.parent), config.env.factory, base.parent)
+    return config
+
+
+def config_to_play(run: Path, env: str | None) -> Config:
+    """Return the options of the environment in which a run or an ONNX file is played; raise ConfigError.
+
+    `env` names a preset; without it it is that of the run's folder, or of the one the file lies in. Then the
+    module of env.factory may also lie where the run found it.
+    """
+    if env is not None:
+        return compose_config([f"env={quoted(env)}"]).config
+    try:
+        folder = find_run(run, "run")
+        config = load_config(folder / CONFIG)
+    except ConfigError as error:
+        if not run.is_file() and not list(run.glob("*.onnx")):
+            raise
+        choices = ", ".join(group_choices()["env"])
+        raise ConfigError(f"{error}; or say in which environment to play it: env=NAME ({choices})") from error
+    if config.env.factory is not None:
+        look_in(factory_folder(folder), config.env.factory, folder)
+    return config

@@ -1,0 +1,115 @@
+"""Environments of a user's own: package.module:function to a BaseEnv.
+
+In: the function's name, a seed and parameters. Out: the environment; what the user's code raises becomes one
+line, with the user's frames of the traceback. There is one rule for where modules are found: Python's path,
+and the working directory.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from traceback import TracebackException
+from typing import Any
+
+from mlagents_envs.base_env import BaseEnv
+
+from mappo_unity.config.option_table import did_you_mean, with_article
+from mappo_unity.config.schema import EnvConfig
+from mappo_unity.config.user_modules import add_working_directory
+from mappo_unity.errors import ConfigError, EnvironmentFailure
+
+OUR_FRAMES = (
+    "<frozen importlib",
+    str(Path(inspect.getfile(importlib)).parent),
+    str(Path(__file__).parents[1]),
+)
+"""Beginnings of file names in a traceback that say nothing about a user's code."""
+
+
+def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapping[str, Any]) -> BaseEnv:
+    """Return a user's environment.
+
+    Raises:
+        ConfigError: the factory does not take the parameters, raised something (its `details` are the user's
+            frames of the traceback), or returned no BaseEnv. ConfigError and EnvironmentFailure of its own
+            pass.
+    """
+    check_call(factory, name, params)
+    try:
+        env = factory(seed=seed, **params)
+    except (ConfigError, EnvironmentFailure):
+        raise
+    except (Exception, SystemExit) as error:
+        raise explain_error(error, name) from error
+    if not isinstance(env, BaseEnv):
+        raise ConfigError(
+            f"{name} returned {with_article(type(env).__name__)}; it must return a "
+            "mlagents_envs.base_env.BaseEnv"
+        )
+    return env
+
+
+def check_call(factory: Callable[..., Any], name: str, params: Mapping[str, Any]) -> None:
+    """Raise ConfigError if a factory does not take these parameters, as far as its signature says."""
+    try:
+        signature = inspect.signature(factory)
+    except (TypeError, ValueError):
+        return  # a builtin without one
+    try:
+        signature.bind(seed=0, **params)
+    except TypeError as error:
+        raise ConfigError(
+            f"{name} cannot be called with seed and {', '.join(params) or 'nothing else'}: {error}; it is "
+            f"{getattr(factory, '__name__', 'function')}{signature}"
+        ) from error
+
+
+def load_factory(path: str, name: str) -> Callable[..., Any]:
+    """Return the function that package.module:function names; raises ConfigError, which calls it `name`."""
+    module_name, _, function_name = path.partition(":")
+    add_working_directory()
+    try:
+        module = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:  # the user's module raises what it likes
+        raise explain_error(error, f"{name}: the module {module_name} cannot be imported: it") from error
+
+    function = getattr(module, function_name, None)
+    if callable(function):
+        return function
+    if function is not None:
+        kind = with_article(type(function).__name__)
+        raise ConfigError(f"{name}: {function_name} is {kind}, but must be a function that returns a BaseEnv")
+    names = sorted(n for n, value in vars(module).items() if _is_own_function(value, module_name))
+    more = ", ..." if len(names) > 20 else ""
+    raise ConfigError(
+        f"{name}: {module_name} has no function {function_name!r}{did_you_mean(function_name, names)}; "
+        f"it has {', '.join(names[:20]) or 'none'}{more}"
+    )
+
+
+def check_factory(cfg: EnvConfig) -> None:
+    """Raise ConfigError if env.factory is given and cannot be imported, or is no function."""
+    if cfg.factory is not None:
+        load_factory(cfg.factory, f"env.factory={cfg.factory}")
+
+
+def explain_error(error: BaseException, who: str) -> ConfigError:
+    """Return the mistake "`who` raised ..." with the traceback of the user's code, without our frames."""
+    text = str(error).strip()
+    mistake = ConfigError(
+        f"{who} raised {type(error).__name__}" + (f": {' '.join(text.split())}" if text else "")
+    )
+    report = TracebackException.from_exception(error)
+    part: TracebackException | None = report
+    while part is not None:
+        part.stack[:] = [frame for frame in part.stack if not frame.filename.startswith(OUR_FRAMES)]
+        part = part.__cause__ or part.__context__
+    mistake.details = tuple("".join(report.format()).splitlines())
+    return mistake
+
+
+def _is_own_function(value: Any, module: str) -> bool:
+    return callable(value) and getattr(value, "__module__", None) == module

@@ -1,0 +1,143 @@
+"""From override lines to a training run: a new one in a folder of its own, or one that is resumed.
+
+In: the lines of a command line. Out: `Launched`. Everything that options alone can tell is checked before
+torch is loaded; a run that is refused leaves nothing behind. Prints nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mappo_unity.config.compose import check_effect, compose_config
+from mappo_unity.config.overrides import given
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
+from mappo_unity.policies.first_checks import check_environment
+from mappo_unity.policies.policy_files import check_resumable
+from mappo_unity.runs import folder as runs
+from mappo_unity.runs.lock import locked
+from mappo_unity.runs.options import compose_resumed
+from mappo_unity.signals import interrupts_wait
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mappo_unity.training.outcome import Outcome
+    from mappo_unity.training.trainer import AfterIteration
+
+Warn = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Launched:
+    """What became of a run: its folder and outcome; where nothing was left to train, a message instead."""
+
+    folder: Path
+    outcome: Outcome | None
+    message: str = ""
+
+
+def launch(
+    lines: list[str],
+    file: Path | None = None,
+    warn: Warn = lambda text: None,
+    console: Console | None = None,
+    after_iteration: AfterIteration | None = None,
+) -> Launched:
+    """Train a new run, or resume the one that ``resume=`` names.
+
+    Args:
+        lines: options, as on the command line.
+        file: a YAML file of options below them.
+        warn: takes a line for the user that is no part of the run.
+        console: where progress goes; None: standard output.
+        after_iteration: see `training.trainer`.
+
+    Raises:
+        ConfigError: a mistake in the options, or what `train` raises.
+    """
+    show = _Show(console, after_iteration)
+    resume = given(lines, "resume")
+    if resume == "":
+        raise ConfigError("resume= is empty: it must name a run folder or a checkpoint file")
+    if resume is not None:
+        return _resume(lines, Path(str(resume)), warn, show)
+    return _train_new(lines, file, warn, show)
+
+
+@dataclass(frozen=True)
+class _Show:
+    """Where progress goes, and who looks on."""
+
+    console: Console | None
+    after_iteration: AfterIteration | None
+
+
+def _train_new(lines: list[str], file: Path | None, warn: Warn, show: _Show) -> Launched:
+    with interrupts_wait():
+        composed = compose_config(lines, file=file)
+        check_effect(lines, [composed.config])
+        check_environment(composed.config)
+
+    folder = runs.create_folder(composed.run_dir, exact=given(lines, "hydra.run.dir") is not None)
+    try:
+        with _locked(folder.path, warn):
+            typed = lines if file is None else [f"--config={file}", *lines]
+            runs.write_record(folder.path, composed.config, typed)
+            return Launched(folder.path, _train(composed.config, folder.path, None, show))
+    except (ConfigError, KeyboardInterrupt) as error:
+        runs.discard_folder(folder, error)
+        raise
+
+
+def _resume(lines: list[str], path: Path, warn: Warn, show: _Show) -> Launched:
+    with interrupts_wait():
+        check_resumable(path, "resume")
+        folder = runs.find_run(path, "resume")
+        config = compose_resumed(lines, folder / runs.CONFIG)
+        check_environment(config)
+
+    with _locked(folder, warn):
+        checkpoint, over = _newest_checkpoint(config, path if path.is_file() else folder, warn)
+        if over is not None:
+            message = f"nothing to train, and nothing was changed: the run in {folder} is over: {over}"
+            return Launched(folder, None, message)
+
+        record = runs.read_record(folder)
+        runs.write_record(folder, config, lines)
+        try:
+            return Launched(folder, _train(config, folder, checkpoint, show))
+        except BaseException:
+            runs.restore_record(folder, record)
+            raise
+
+
+def _newest_checkpoint(config: Config, source: Path, warn: Warn) -> tuple[Path, str | None]:
+    """Return the newest good checkpoint, and why there is nothing to train from it (or None)."""
+    with interrupts_wait():
+        from mappo_unity.runs.checkpoint import newest_good
+        from mappo_unity.training.trainer import why_over
+
+    checkpoint, warnings = newest_good(source)
+    for warning in warnings:
+        warn(warning)
+    return checkpoint, why_over(config, checkpoint)
+
+
+@contextmanager
+def _locked(folder: Path, warn: Warn) -> Iterator[None]:
+    with locked(folder) as warning:
+        if warning is not None:
+            warn(warning)
+        yield
+
+
+def _train(config: Config, folder: Path, checkpoint: Path | None, show: _Show) -> Outcome:
+    with interrupts_wait():
+        from mappo_unity.training.trainer import train
+
+    return train(config, folder, checkpoint, show.after_iteration, show.console)

@@ -1,0 +1,25 @@
+"""Whether a video can be drawn and written, or a window be opened, here: asked before torch is loaded.
+
+In: `PlayConfig` and what the system has. Out: nothing, or a `ConfigError` that names what is missing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mappo_unity.config.schema import PlayConfig
+from mappo_unity.scenes.mujoco_check import check_mujoco
+
+
+def check_screen(cfg: PlayConfig) -> None:
+    """Raise ConfigError if the video cannot be written or drawn, or no window can be opened."""
+    check_mujoco()
+    if cfg.video is None:
+        from mappo_unity.viewing.window import check_display
+
+        return check_display()
+    from mappo_unity.viewing.render import check_opengl
+    from mappo_unity.viewing.video import check_video
+
+    check_video(Path(cfg.video))
+    check_opengl()
