@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mappo_unity.cli.arguments import check_duration
 
 from mappo_unity.cli import doctor_main
 from mappo_unity.cli.doctor import CURES, diagnose, port_state
@@ -215,3 +216,9 @@ def test_a_run_is_not_for_the_doctor(tmp_path: Path) -> None:
 def test_options_out_of_range_are_named(option, value):
     with pytest.raises(ConfigError, match=f"{option} {value} is out of range: it must be"):
         diagnose(["--editor", option, value], print)
+
+
+def test_a_duration_must_be_finite() -> None:
+    for value, words in ((float("inf"), "must be > 0, and finite"), (0.0, "must be > 0")):
+        with pytest.raises(ConfigError, match=f"--timeout {value:g} is out of range: it {words}$"):
+            check_duration("--timeout", value)

@@ -20,6 +20,10 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return place
 
 
+def test_the_place_is_where_the_package_lies() -> None:
+    assert (extras.ROOT / "mappo_unity" / "__init__.py").is_file()
+
+
 def make_clone(place: Path) -> None:
     (place / "pyproject.toml").touch()
     (place / "scripts").mkdir()

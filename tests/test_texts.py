@@ -20,6 +20,7 @@ from mappo_unity.config.overrides import given, parse, shell_argument
 from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, PlayConfig
 from mappo_unity.config.text_lines import key_name, key_spelling, literal_lines
 from mappo_unity.errors import ConfigError
+from mappo_unity.protocol.process import find_executable
 from mappo_unity.training.sweep import run_sweep
 
 NAMES = [
@@ -254,6 +255,18 @@ def test_a_path_that_is_missing_is_named_as_it_is(
     assert train_main(["hydra.run.dir=mine"]) == 0
     assert main([f"run=/nowhere/{name}"]) == 2
     assert f"run=/nowhere/{name} does not exist; newest runs below .: mine" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a player's file has another form there")
+@pytest.mark.parametrize("name", ["Game.x86_64", "Game"])
+@pytest.mark.parametrize("folder", ["jürgen", "a=b, [1] (2) *", "old.x86 builds"])
+def test_a_player_is_found_in_a_folder_of_any_letters(folder: str, name: str, tmp_path: Path) -> None:
+    player = tmp_path / folder / name
+    player.parent.mkdir()
+    player.touch(0o755)
+    assert find_executable(str(player)) == player
+    if folder != "old.x86 builds":  # from which ML-Agents takes the extension, wherever it stands
+        assert find_executable(str(player.with_suffix(""))) == player
 
 
 def test_an_output_in_ascii_ends_no_run(training: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:

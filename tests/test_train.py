@@ -12,6 +12,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mappo_unity.cli import train_main
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import (
     CollectConfig,
@@ -329,3 +330,18 @@ def test_a_training_says_what_the_environment_needs_and_the_trainer_lacks(tmp_pa
     assert f"note: {note}" in capfd.readouterr().out
     for name in ("Hallway", "Pyramids"):
         assert "this trainer has no" in str(compose_config([f"env={name}"]).config.env.note)
+
+
+def test_the_folder_is_named_when_the_run_begins(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small = ["env=Basic", "env.num_areas=2", "collect.rounds=4", "ppo.minibatch_size=4", "export_onnx=false"]
+    lines = [*small, "max_steps=8", "log.backends=[]"]
+    assert train_main([*lines, "env.params.nothing=1"]) == 2
+    captured = capsys.readouterr()
+    assert "has no parameter 'nothing'" in captured.err and captured.out == ""
+    assert train_main([*lines, "hydra.run.dir=mine"]) == 0
+    assert capsys.readouterr().out.startswith("run folder: mine\n")
+    assert train_main(["resume=mine", "max_steps=16", "behaviors.Nobody.ppo.lr=1"]) == 2
+    assert capsys.readouterr().out == ""
+    assert train_main(["resume=mine", "max_steps=16"]) == 0
+    assert capsys.readouterr().out.startswith("continuing from mine")

@@ -82,6 +82,8 @@ def check_overrides(
         key = override.key_or_group
         if isinstance(override.value(), Glob):
             raise ConfigError(f"{line}: glob chooses presets (env, recipe); give {key}'s values: {key}=a,b,c")
+        if override.is_sweep_override() and not groups:
+            raise ConfigError(f"{line}: {key} takes one value here; only mappo-train -m takes several")
         if override.is_sweep_override() and not sweep:
             raise ConfigError(
                 f"{line}: several values for {key} make a sweep, which needs -m "

@@ -10,6 +10,7 @@ systems a player leaves when its connection breaks.
 from __future__ import annotations
 
 import errno
+import glob
 import os
 import signal
 import subprocess
@@ -55,14 +56,16 @@ def find_executable(file_name: str, option: str = "env.file_name") -> Path:
         raise ConfigError(f"{option}= is empty: give the path of the built player")
     path = Path(os.path.expanduser(file_name))
     _check_link(path, f"{option}={file_name}")
-    place = validate_environment_path(str(path)) or path
-    if not Path(place).is_file():
+    # ML-Agents takes the name for a pattern; where that finds nothing, its brackets are letters
+    matched = validate_environment_path(str(path)) or validate_environment_path(glob.escape(str(path)))
+    place = Path(matched or path)
+    if not place.is_file():
         kinds = {"darwin": ".app", "win32": ".exe"}.get(sys.platform, ".x86_64, .x86, or no extension")
         raise ConfigError(
             f"{option}={file_name}: no Unity player is there; looked for {path.absolute()} with "
             f"{kinds}; give the path of the built player{_inside(path) or _beside(path)}"
         )
-    found = Path(place).absolute()
+    found = place.absolute()
     if not os.access(found, os.X_OK):
         raise ConfigError(
             f"{option}={file_name}: {found} is not executable; run: chmod +x {shell_word(found)}"
