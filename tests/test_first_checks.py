@@ -13,9 +13,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from mappo_unity.config.schema import Backend, Config, EnvConfig, PlayConfig
+from mappo_unity.config.schema import Backend, Config, EnvConfig, EvalConfig, PlayConfig
 from mappo_unity.errors import ConfigError
-from mappo_unity.policies.first_checks import check_embedded, check_environment, check_film, check_out
+from mappo_unity.policies.first_checks import (
+    check_embedded,
+    check_environment,
+    check_evaluation,
+    check_film,
+    check_out,
+)
 from mappo_unity.policies.policy_files import (
     Kind,
     check_checkpoint,
@@ -172,6 +178,19 @@ def test_a_film_of_what_cannot_be_drawn(place: Path) -> None:
         check_film(PlayConfig(env="unity"))
     with pytest.raises(ConfigError, match="env.backend=editor: look at it in Unity"):
         check_embedded(EnvConfig(backend=Backend.editor))
+
+
+def test_a_player_that_has_gone_is_told_with_the_file_that_names_it(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", "3DBall")
+    config = run / "config.yaml"
+    moved = config.read_text().replace("backend: embedded", "backend: player")
+    config.write_text(moved.replace("file_name: null", "file_name: gone/Game"))
+    with pytest.raises(
+        ConfigError, match=f"env.file_name=gone/Game: no Unity player.*; so says {config}, where"
+    ):
+        check_evaluation(EvalConfig(run=str(run)))
+    with pytest.raises(ConfigError, match="mappo-play shows embedded scenes, but this environment has"):
+        check_film(PlayConfig(run=str(run)))
 
 
 def test_plain_values_of_a_checkpoint_are_read_without_its_tensors(place: Path) -> None:

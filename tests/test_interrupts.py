@@ -65,3 +65,18 @@ def test_after_the_block_interrupts_are_what_they_were():
     with interrupts_end("mappo-eval"):
         pass
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_interrupt_while_python_ends_adds_nothing():
+    code = (
+        "import atexit, os, signal, sys\n"
+        "from mappo_unity import cli\n"
+        "def interrupted(lines):\n"
+        "    raise KeyboardInterrupt\n"
+        "cli._eval_command = interrupted\n"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+        "sys.argv = ['mappo-eval', 'run=a']\n"
+        "sys.exit(cli.eval_main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stderr) == (130, "mappo-eval: interrupted\n")

@@ -33,6 +33,18 @@ from mappo_unity.errors import ConfigError
         ("run =ball", "run has no value: it is written run=ball, without spaces"),
         ("run=ball episodes=3 run=walls", "run is given twice, run=ball and run=walls: give it once"),
         (
+            "ppo.lr=3",
+            "ppo.lr is an option of mappo-train, not of mappo-eval: a run's own options count; options h",
+        ),
+        ("env.params.mass=2", "env.params.mass is an option of mappo-train, not of mappo-eval"),
+        ("recipe=mlagents", "recipe is an option of mappo-train, not of mappo-eval"),
+        ("hydra.run.dir=x", "hydra.run.dir is an option of mappo-train, not of mappo-eval"),
+        ("video=x.mp4", "video is an option of mappo-play, not of mappo-eval; options here: run, episodes"),
+        ("run=${env}", "run=${env}: ${...} is for the options of"),
+        ("run:ball", "'run:ball' is not of the form option=value: it is written run=ball"),
+        ("help", "'help' is not of the form option=value (did you mean --help?)"),
+        ("--hlep", "--hlep is not an option (did you mean --help?)"),
+        (
             "run=ball seed=1,2",
             "seed=1,2: seed takes one value; a text with a comma stands in quotes inside quotes",
         ),
@@ -41,7 +53,7 @@ from mappo_unity.errors import ConfigError
 def test_each_is_told_how_it_is_written(line: str, words: str) -> None:
     with pytest.raises(ConfigError) as error:
         compose_plain(line.split(), EvalConfig)
-    assert words in str(error.value) and "mappo-train" not in str(error.value)
+    assert words in str(error.value) and "mappo-train -m" not in str(error.value)
 
 
 def test_what_is_written_well_passes() -> None:

@@ -14,6 +14,7 @@ import errno
 import importlib
 import io
 import os
+import signal
 import sys
 from contextlib import suppress
 
@@ -76,6 +77,8 @@ def _run(command: str, arguments: list[str] | None) -> int:
         print(f"{name}: {error}", *error.details, sep="\n", file=sys.stderr)
         return 3
     except KeyboardInterrupt as error:
+        if arguments is None:  # a second Ctrl-C would only find Python taking itself down
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         print(f"{name}: interrupted", file=sys.stderr)
         return 128 + int(getattr(error, "signal", 2))
     except OSError as error:  # what nobody below knew the option of

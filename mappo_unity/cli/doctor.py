@@ -19,7 +19,7 @@ from mappo_unity.cli.findings import CURES, Report, Say
 from mappo_unity.cli.switches import Once, Parser, number, whole_number
 from mappo_unity.config.ranges import check_duration, check_range
 from mappo_unity.errors import ConfigError
-from mappo_unity.protocol.ports import port_state
+from mappo_unity.protocol.ports import FORBIDDEN, port_state
 from mappo_unity.scenes.mujoco_check import check_mujoco
 
 PACKAGES = ("torch", "torchrl", "tensordict", "mlagents-envs", "protobuf", "grpcio", "numpy", "mujoco")
@@ -78,7 +78,7 @@ def examine_packages(report: Report) -> None:
     try:
         check_mujoco()
     except ConfigError as error:
-        report.fail(str(error))
+        report.mistake(error)
 
 
 def examine_ports(report: Report, editor_port: int) -> None:
@@ -88,12 +88,15 @@ def examine_ports(report: Report, editor_port: int) -> None:
             free.bind(("127.0.0.1", 0))
             report.good(f"free ports for players, for example {free.getsockname()[1]}")
     except OSError as error:
-        report.fail(f"no port of 127.0.0.1 can be had: {error}", "is the loopback interface up?")
+        report.fail(
+            f"no port of 127.0.0.1 can be had: {error}", "bring the loopback interface up: ip link set lo up"
+        )
     state = port_state(editor_port)
     if state == "free":
         report.good(f"port {editor_port} (Unity Editor) is free")
     else:
-        report.warn(f"port {editor_port} (Unity Editor) is taken", CURES[state])
+        what = "may not be listened on" if state == FORBIDDEN else "is taken"
+        report.warn(f"port {editor_port} (Unity Editor) {what}", CURES[state])
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         report.warn("DISPLAY is not set", CURES["display"])
 

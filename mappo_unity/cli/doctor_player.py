@@ -34,11 +34,13 @@ def examine_player(report: Report, options: argparse.Namespace) -> None:
             executable = find_executable(options.file_name, "--file-name")
             report.good(f"executable {executable}")
     except ConfigError as error:  # says what to do
-        return report.fail(str(error))
+        return report.mistake(error)
     folder = Path(tempfile.mkdtemp(prefix="mappo-doctor-"))
-    _examine_running(report, options, executable, folder / "Player.log")
-    if not report.failures:  # else a finding may name the log in it
-        shutil.rmtree(folder, ignore_errors=True)
+    try:
+        _examine_running(report, options, executable, folder / "Player.log")
+    finally:
+        if not report.failures:  # else a finding may name the log in it
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _examine_running(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from mappo_unity.config.schema import ConfigError
 from mappo_unity.protocol.ports import FORBIDDEN
 
 CURES = {
@@ -50,7 +51,12 @@ class Report:
         self.warnings += 1
         self._say(f"  look  {text}\n        {cure}")
 
-    def fail(self, text: str, cure: str = "") -> None:
+    def fail(self, text: str, cure: str) -> None:
         """Say that something does not work, and what to do."""
         self.failures += 1
-        self._say(f"  FAIL  {text}" + (f"\n        {cure}" if cure else ""))
+        self._say(f"  FAIL  {text}\n        {cure}")
+
+    def mistake(self, error: ConfigError) -> None:
+        """Say a mistake, whose message says what to do."""
+        self.failures += 1
+        self._say(f"  FAIL  {error}")

@@ -6,11 +6,22 @@ nothing, or a `ConfigError` that says how it is written.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 
-from mappo_unity.config.option_table import Option, did_you_mean, option_table
+from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table
 from mappo_unity.config.overrides import parse, shell_word
+from mappo_unity.config.presets import group_choices
+from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, PlayConfig
 from mappo_unity.errors import ConfigError
+
+_COMMANDS = {
+    "mappo-train": Config,
+    "mappo-eval": EvalConfig,
+    "mappo-play": PlayConfig,
+    "mappo-export": ExportConfig,
+}
+"""The commands that take option=value, and their options."""
 
 
 def check_form(lines: Sequence[str], schema: type) -> None:
@@ -26,6 +37,10 @@ def check_form(lines: Sequence[str], schema: type) -> None:
         if key in seen:
             raise ConfigError(f"{key} is given twice, {seen[key]} and {line}: give it once")
         seen[key] = line
+        if key not in table:
+            _check_other_command(key, schema, table)
+        if "${" in line:
+            raise ConfigError(f"{line}: ${{...}} is for the options of mappo-train; write the value itself")
     for override, line in zip(parse(list(lines)), lines):
         if override.is_sweep_override():
             raise ConfigError(
@@ -34,13 +49,28 @@ def check_form(lines: Sequence[str], schema: type) -> None:
             )
 
 
+def _check_other_command(key: str, schema: type, table: dict[str, Option]) -> None:
+    """Raise ConfigError for an option that another command has."""
+    tables = {name: option_table(other) for name, other in _COMMANDS.items() if other is not schema}
+    owners = [name for name, other in tables.items() if find_option(other, key) is not None]
+    if key in group_choices() or key.startswith(("hydra.", "hydra/")):
+        owners = ["mappo-train"]
+    if not owners:
+        return
+    own = next((name for name, other in _COMMANDS.items() if other is schema), "this command")
+    hint = ": a run's own options count" if owners == ["mappo-train"] else ""
+    raise ConfigError(
+        f"{key} is an option of {' and '.join(owners)}, not of {own}{hint}; options here: {', '.join(table)}"
+    )
+
+
 def _switch(lines: Sequence[str], number: int, table: dict[str, Option]) -> str:
     """Say how a switch (--run=x, --run x) is written here."""
     key, equals, value = lines[number].partition("=")
     name = key.lstrip("-").replace("-", "_")
     rule = "options are written option=value, and the only switches are --help and --version"
     if name not in table:
-        return f"{key} is not an option{did_you_mean(name, table)}: {rule}"
+        return f"{key} is not an option{_near(name, table)}: {rule}"
     following = [value] if equals else lines[number + 1 : number + 2]
     return f"{key} is written {name}={_value(following, table[name])}: {rule}"
 
@@ -52,8 +82,18 @@ def _word(lines: Sequence[str], number: int, table: dict[str, Option]) -> str:
     if word in table:
         value = _value(rest, table[word])
         return f"{word} has no value: it is written {word}={value}, without spaces"
-    hint = did_you_mean(word, table) or f" (did you mean {next(iter(table))}={shell_word(word)}?)"
+    name, colon, value = word.partition(":")
+    if colon and name in table:
+        return f"{word!r} is not of the form option=value: it is written {name}={shell_word(value)}"
+    guess = f" (did you mean {next(iter(table))}={shell_word(word)}?)" if word else ""
+    hint = _near(word, table) or guess
     return f"{word!r} is not of the form option=value{hint}; options: {', '.join(table)}"
+
+
+def _near(name: str, table: dict[str, Option]) -> str:
+    """Return a hint at the option or switch that a misspelt name is like, or an empty text."""
+    switches = difflib.get_close_matches(name.lower(), ["help", "version"], 1, 0.7)
+    return f" (did you mean --{switches[0]}?)" if switches else did_you_mean(name, table)
 
 
 def _value(following: Sequence[str], option: Option) -> str:

@@ -39,8 +39,17 @@ def check_evaluation(cfg: EvalConfig) -> None:
     if cfg.opponent is not None:
         sources.append(locate(cfg.opponent, "opponent"))
     known = [_open(source, cfg.deterministic) for source in sources]
-    env = _environment(sources[0], known[0], cfg.env, "mappo-eval").env
-    behaviors = _behaviors(env)
+    config = _environment(sources[0], known[0], cfg.env, "mappo-eval")
+    try:
+        check_environment(config)
+    except ConfigError as error:
+        if cfg.env is not None:
+            raise
+        said = f"; so says {find_run(sources[0].path, 'run') / CONFIG}, where it can be changed"
+        told = ConfigError(f"{error}{said}")
+        told.details = error.details
+        raise told from error
+    behaviors = _behaviors(config.env)
     if behaviors and cfg.opponent is not None:
         check_two_sides(behaviors)
     _check_fit(sources, known, behaviors)
@@ -51,9 +60,10 @@ def check_film(cfg: PlayConfig) -> None:
     option = "run" if cfg.run is not None else "policy"
     source = locate(cfg.run or cfg.policy or "random", option)
     known = _open(source, cfg.deterministic)
-    env = _environment(source, known, cfg.env, "mappo-play").env
-    check_embedded(env)
-    _check_fit([source], [known], _behaviors(env))
+    config = _environment(source, known, cfg.env, "mappo-play")
+    check_embedded(config.env)
+    check_environment(config)
+    _check_fit([source], [known], _behaviors(config.env))
 
 
 def check_export(cfg: ExportConfig) -> None:
@@ -127,7 +137,7 @@ def _open(source: Source, deterministic: bool) -> Any:
 
 
 def _environment(source: Source, known: Any, env: str | None, command: str) -> Config:
-    """Return the options of the environment to play in, checked; see `config_to_play`."""
+    """Return the options of the environment to play in; see `config_to_play`."""
     scenes = [name for name in group_choices()["env"] if name in scene_names()]
     if env is None and (source.kind is Kind.random or not _lies_in_run(source)):
         trained = _trained_in(known)
@@ -143,9 +153,7 @@ def _environment(source: Source, known: Any, env: str | None, command: str) -> C
             f"env={env} needs options of an environment of your own, which {command} does not take: leave "
             "env out and name a run of that environment, or a file in its folder, and its own options count"
         )
-    config = config_to_play(source.path, env)
-    check_environment(config)
-    return config
+    return config_to_play(source.path, env)
 
 
 def _lies_in_run(source: Source) -> bool:
