@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mappo_unity.cli.arguments import check_duration
 
 from mappo_unity.cli import doctor_main
 from mappo_unity.cli.doctor import CURES, diagnose, port_state
 from mappo_unity.cli.player import run as player_main
+from mappo_unity.config.ranges import check_duration
 from mappo_unity.errors import ConfigError
 
 BAD_PLAYER = Path(__file__).with_name("bad_player.py")
