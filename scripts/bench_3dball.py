@@ -41,7 +41,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     cfg = compose_config(
-        ["env=3DBall", f"seed={arguments.seed}", "log.backends=[]", "log.progress=false"]
+        ["env=3DBall", f"seed={arguments.seed}", "log.loggers=[]", "log.progress=false"]
     ).config
     print(
         f"load average at the start: {os.getloadavg()[0]:.2f}; {os.cpu_count()} cores; "

@@ -76,7 +76,7 @@ def options(arguments: argparse.Namespace, build: str, *more: str) -> Config:
     lines = [f"env={arguments.scene}", "env.backend=player", f"env.file_name={build}", *areas, *more]
     if arguments.max_steps is not None:
         lines.append(f"max_steps={arguments.max_steps}")
-    quiet = ["log.backends=[]", "log.progress=false", "export_onnx=false", "matches.interval=null"]
+    quiet = ["log.loggers=[]", "log.progress=false", "export_onnx=false", "matches.interval=null"]
     return compose_config([*lines, *quiet, f"seed={arguments.seed}"]).config
 
 

@@ -56,7 +56,7 @@ COMMON = (
     "ppo.epochs=10",
     "model.init_log_std=1",  # about the range of actions
     "log.progress=false",
-    "log.backends=[]",
+    "log.loggers=[]",
     "export_onnx=false",
 )
 TASKS = {

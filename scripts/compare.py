@@ -28,7 +28,7 @@ from mappo_unity.training.run_state import RunState
 from mappo_unity.training.setup import TrainingSetup, set_up
 from mappo_unity.training.trainer import train
 
-QUIET = ["log.progress=false", "log.backends=[]", "export_onnx=false", "checkpoint_interval=1000000000"]
+QUIET = ["log.progress=false", "log.loggers=[]", "export_onnx=false", "checkpoint_interval=1000000000"]
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ import torch
 GOLDEN = Path(__file__).parent / "golden"
 TIMES = ("wall_s", "steps_per_s", "collect_s", "update_s")
 
-_SMALL = ["collect.rounds=48", "ppo.minibatch_size=64", "log.backends=[]", "log.progress=false", "seed=7"]
+_SMALL = ["collect.rounds=48", "ppo.minibatch_size=64", "log.loggers=[]", "log.progress=false", "seed=7"]
 _COMMON = [*_SMALL, "export_onnx=false", "num_threads=1", "update_threads=1", "checkpoint_interval=1"]
 RUNS = {
     "3DBall": ["env=3DBall", "env.num_areas=6"],

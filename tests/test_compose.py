@@ -17,7 +17,7 @@ from mappo_unity.config.option_table import option_table
 from mappo_unity.config.overrides import given, shell_argument
 from mappo_unity.config.per_behavior import behavior_config
 from mappo_unity.config.presets import conf_dir
-from mappo_unity.config.schema import Activation, Config, EvalConfig, LogBackend
+from mappo_unity.config.schema import Activation, Config, EvalConfig, LoggerKind
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.folder import CONFIG, write_record
 from mappo_unity.runs.options import compose_resumed
@@ -84,11 +84,11 @@ def test_later_sources_win(own_conf: Path) -> None:
 
 def test_values_arrive_with_their_types() -> None:
     config = compose_config(
-        ["model.hidden=[32,16]", "model.activation=relu", "log.backends=[csv,wandb]", "stop_at_return=95"]
+        ["model.hidden=[32,16]", "model.activation=relu", "log.loggers=[csv,wandb]", "stop_at_return=95"]
     ).config
     assert config.model.hidden == [32, 16]
     assert config.model.activation is Activation.relu
-    assert config.log.backends == [LogBackend.csv, LogBackend.wandb]
+    assert config.log.loggers == [LoggerKind.csv, LoggerKind.wandb]
     assert config.stop_at_return == 95.0 and isinstance(config.stop_at_return, float)
 
 
@@ -149,7 +149,7 @@ def test_run_folder_is_named_by_env_and_by_the_user() -> None:
         ("model.hidden=3", ["model.hidden=3", "a list of whole numbers", "[128,128]"]),
         ("model.hidden=[a]", ["model.hidden=[a]", "a list of whole numbers"]),
         ("model.activation=foo", ["model.activation=foo", "one of tanh, relu, silu, elu"]),
-        ("log.backends=[csv,tb]", ["log.backends=[csv,tb]", "any of csv, tensorboard, wandb, mlflow"]),
+        ("log.loggers=[csv,tb]", ["log.loggers=[csv,tb]", "any of csv, tensorboard, wandb, mlflow"]),
         ("env.params=3", ["env.params=3", "named values"]),
         ("ppo.gamma=2", ["ppo.gamma=2", "out of range", "from 0 to 1"]),
         ("ppo.lr=nan", ["ppo.lr=nan", "must be > 0, and finite"]),
@@ -269,7 +269,7 @@ def test_a_missing_sweep_package_names_the_extra(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_run_goes_on_with_its_own_options(tmp_path: Path) -> None:
-    lines = ["env.params.mass=2", "model.hidden=[8]", "max_steps=50", "log.backends=[csv]"]
+    lines = ["env.params.mass=2", "model.hidden=[8]", "max_steps=50", "log.loggers=[csv]"]
     config = compose_config(lines).config
     write_record(tmp_path, config, lines)
     assert load_config(tmp_path / CONFIG) == config

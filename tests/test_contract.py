@@ -212,7 +212,7 @@ def test_a_snapshot_that_cannot_be_put_back_is_none(monkeypatch: Any) -> None:
 
 TINY = [
     *("env=custom", "env.name=Crew", "env.factory=broken_envs:make", "collect.rounds=4", "max_steps=40"),
-    *("model.hidden=[4]", "ppo.epochs=1", "ppo.num_minibatches=1", "log.backends=[]", "log.progress=false"),
+    *("model.hidden=[4]", "ppo.epochs=1", "ppo.num_minibatches=1", "log.loggers=[]", "log.progress=false"),
     "export_onnx=false",
 ]
 

@@ -30,7 +30,7 @@ EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "custom_env.py"
 FACTORY = "env.factory=custom_env:make"
 TINY = [
     *("env=custom", "env.name=Points", FACTORY, "env.params.num_agents=4", "collect.rounds=8"),
-    *("model.hidden=[8]", "ppo.epochs=1", "ppo.num_minibatches=2", "log.backends=[]", "log.progress=false"),
+    *("model.hidden=[8]", "ppo.epochs=1", "ppo.num_minibatches=2", "log.loggers=[]", "log.progress=false"),
     *("export_onnx=false", "checkpoint_interval=1"),
 ]
 

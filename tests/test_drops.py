@@ -157,7 +157,7 @@ def test_past_the_limit_there_is_a_checkpoint_and_exit_code_3(tmp_path: Path, ca
             "collect.rounds=20",
             "ppo.minibatch_size=60",
             "model.hidden=[16]",
-            "log.backends=[csv]",
+            "log.loggers=[csv]",
             "log.progress=false",
             "export_onnx=false",
             f"output_dir={tmp_path}",

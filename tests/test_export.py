@@ -35,7 +35,7 @@ def options(iterations, **changes):
         model=ModelConfig(hidden=[16]),
         ppo=PPOConfig(minibatch_size=32),
         collect=CollectConfig(rounds=ROUNDS),
-        log=LogConfig(backends=[], progress=False),
+        log=LogConfig(loggers=[], progress=False),
         max_steps=iterations * AREAS * ROUNDS,
         checkpoint_interval=AREAS * ROUNDS,
     )
@@ -278,7 +278,7 @@ def test_run_policy_earns_what_mappo_eval_says(shared, tmp_path, deterministic):
     the share of episodes that run_policy leaves unfinished, the longer ones, small.
     """
     episodes = 800
-    lines = ["env=3DBall", "max_steps=40000", "log.backends=[]", "log.progress=false"]
+    lines = ["env=3DBall", "max_steps=40000", "log.loggers=[]", "log.progress=false"]
     cfg = compose_config(lines).config
     write_record(tmp_path, cfg, lines)
     train(cfg, tmp_path)

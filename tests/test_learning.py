@@ -12,7 +12,7 @@ from mappo_unity.training.trainer import train
 
 @pytest.mark.slow
 def test_3dball_is_solved_with_its_preset_and_the_checkpoint_plays_as_well(tmp_path: Path) -> None:
-    lines = ["env=3DBall", "log.backends=[]", "log.progress=false"]
+    lines = ["env=3DBall", "log.loggers=[]", "log.progress=false"]
     cfg = compose_config(lines).config
     write_record(tmp_path, cfg, lines)
     outcome = train(cfg, tmp_path)

@@ -19,15 +19,15 @@ import pytest
 from rich.console import Console
 
 from mappo_unity.config.extras import install_command
-from mappo_unity.config.schema import LogBackend, LogConfig
+from mappo_unity.config.schema import LogConfig, LoggerKind
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.logger import RunLog, read_metrics
 from mappo_unity.runs.metrics_csv import MetricsFile, keep_until
 from mappo_unity.runs.progress import Progress, describe, job_of_sweep
 
 NAN = math.nan
-TENSORBOARD = LogConfig(backends=[LogBackend.tensorboard], progress=False)
-CSV_ONLY = LogConfig(backends=[], progress=False)
+TENSORBOARD = LogConfig(loggers=[LoggerKind.tensorboard], progress=False)
+CSV_ONLY = LogConfig(loggers=[], progress=False)
 
 
 def row(iteration: int, **more: Any) -> dict[str, Any]:
@@ -197,7 +197,7 @@ def test_a_new_run_does_not_write_into_an_old_one(tmp_path: Path) -> None:
 
 
 def test_resumed_run_has_the_rows_of_an_undisturbed_one(tmp_path: Path) -> None:
-    both = LogConfig(backends=[LogBackend.csv, LogBackend.tensorboard], progress=False)
+    both = LogConfig(loggers=[LoggerKind.csv, LoggerKind.tensorboard], progress=False)
     write(tmp_path / "whole", range(1, 7), both)
     write(tmp_path / "resumed", range(1, 6), both)
     write(tmp_path / "resumed", range(4, 7), both, resume_steps=300)
@@ -318,9 +318,9 @@ def test_killed_writer_loses_no_row(tmp_path: Path) -> None:
     code = f"""
 import os, signal
 from pathlib import Path
-from mappo_unity.config.schema import LogBackend, LogConfig
+from mappo_unity.config.schema import LoggerKind, LogConfig
 from mappo_unity.runs.logger import RunLog
-log = RunLog(LogConfig(backends=[LogBackend.tensorboard], progress=False), Path({str(tmp_path)!r}), 1000)
+log = RunLog(LogConfig(loggers=[LoggerKind.tensorboard], progress=False), Path({str(tmp_path)!r}), 1000)
 for i in range(1, 6):
     log.log({{"iteration": i, "agent_steps": 100 * i, "x": i / 2}})
 os.kill(os.getpid(), signal.SIGKILL)
@@ -347,7 +347,7 @@ def test_events_hold_the_numbers_without_nan(tmp_path: Path) -> None:
 def test_missing_logger_names_the_extra(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda package: None)
     with pytest.raises(ConfigError, match=rf"log\.backends has {name}") as caught:
-        RunLog(LogConfig(backends=[LogBackend[name]]), tmp_path / "run", 1000)
+        RunLog(LogConfig(loggers=[LoggerKind[name]]), tmp_path / "run", 1000)
     assert install_command(name) in str(caught.value)
     assert not (tmp_path / "run").exists()
 
@@ -355,7 +355,7 @@ def test_missing_logger_names_the_extra(name: str, tmp_path: Path, monkeypatch: 
 def test_wandb_offline_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
-    cfg = LogConfig(backends=[LogBackend.wandb], progress=False)
+    cfg = LogConfig(loggers=[LoggerKind.wandb], progress=False)
     write(tmp_path, range(1, 3), cfg)
     name = (tmp_path / "wandb_id").read_text()
     write(tmp_path, range(3, 4), cfg, resume_steps=200)
@@ -366,7 +366,7 @@ def test_wandb_offline_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_mlflow_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mlflow = pytest.importorskip("mlflow")
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    cfg = LogConfig(backends=[LogBackend.mlflow], progress=False, project="balls")
+    cfg = LogConfig(loggers=[LoggerKind.mlflow], progress=False, project="balls")
     write(tmp_path / "run", range(1, 4), cfg)
     assert mlflow.active_run() is None
     (run,) = mlflow.search_runs(experiment_names=["balls"], output_format="list")
@@ -433,7 +433,7 @@ def test_the_lines_of_a_job_name_it(tmp_path: Path) -> None:
     console, text = plain_console()
     with (
         job_of_sweep(3, is_beside_others=False),
-        RunLog(LogConfig(backends=[]), tmp_path, 1000, console=console) as log,
+        RunLog(LogConfig(loggers=[]), tmp_path, 1000, console=console) as log,
     ):
         log.message("run folder: here")
         log.log(row(1))
@@ -470,7 +470,7 @@ def test_time_left_is_reckoned_from_the_last_half_minute() -> None:
 def test_on_a_terminal_one_line_is_updated_and_messages_stand_above(tmp_path: Path) -> None:
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=100, _environ={"TERM": "xterm"})
-    cfg = LogConfig(backends=[])
+    cfg = LogConfig(loggers=[])
     with RunLog(cfg, tmp_path, 1000, console=console) as log:
         log.log(row(1))
         log.message("rolled back [an update] 100% of 3")
@@ -516,7 +516,7 @@ def test_progress_off_prints_nothing_but_messages(tmp_path: Path) -> None:
 
 def test_closing_twice_and_after_an_error(tmp_path: Path) -> None:
     console, text = plain_console()
-    log = RunLog(LogConfig(backends=[LogBackend.tensorboard]), tmp_path, 1000, console=console)
+    log = RunLog(LogConfig(loggers=[LoggerKind.tensorboard]), tmp_path, 1000, console=console)
     with pytest.raises(RuntimeError, match="from the loop"), log:
         log.log(row(1))
         log.log(row(2))

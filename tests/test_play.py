@@ -64,7 +64,7 @@ def test_a_run_is_shown_from_the_command_line(
         model=ModelConfig(hidden=[8]),
         ppo=PPOConfig(minibatch_size=16),
         collect=CollectConfig(rounds=8),
-        log=LogConfig(backends=[], progress=False),
+        log=LogConfig(loggers=[], progress=False),
         max_steps=16,
     )
     run = tmp_path / "run"

@@ -20,7 +20,7 @@ def test_four_jobs_two_at_a_time_fight_over_no_port(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     player_main(["build", "3DBall", str(tmp_path)])
     player = ["env=3DBall", "env.backend=player", f"env.file_name={tmp_path / '3DBall'}", "env.num_areas=12"]
-    small = ["max_steps=6000", "collect.batch_size=2048", "log.backends=[]", "log.progress=false"]
+    small = ["max_steps=6000", "collect.batch_size=2048", "log.loggers=[]", "log.progress=false"]
     sweep = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1,2,3"]
     done = subprocess.run(
         [sys.executable, "-c", COMMAND, *sweep, *player, *small],

@@ -45,7 +45,7 @@ def learn(probe, tmp_path, iterations=60, actions="discrete", model=None, ppo=No
             )
         ),
         collect=CollectConfig(rounds=rounds),
-        log=LogConfig(backends=[], progress=False),
+        log=LogConfig(loggers=[], progress=False),
         max_steps=10**9,
     )
     with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:

@@ -18,12 +18,12 @@ from mappo_unity.training.setup import TrainingSetup
 ITERATION = 16 * 16  # decisions: 16 rounds of 16 agents
 FAILING = [
     *("env=custom", "env.factory=failing_env:make", "env.params.at=70", "collect.rounds=16"),
-    *("ppo.minibatch_size=256", "model.hidden=[8]", "log.backends=[]", "hydra.run.dir=run"),
+    *("ppo.minibatch_size=256", "model.hidden=[8]", "log.loggers=[]", "hydra.run.dir=run"),
     *("max_steps=100000", "checkpoint_interval=1000000", "export_onnx=false", "seed=5"),
 ]
 BASIC = [
     *("env=Basic", "env.num_areas=16", "collect.rounds=16", "ppo.minibatch_size=256", "model.hidden=[8]"),
-    *("log.backends=[]", "hydra.run.dir=run", "export_onnx=false"),
+    *("log.loggers=[]", "hydra.run.dir=run", "export_onnx=false"),
 ]
 
 
@@ -186,7 +186,7 @@ def test_a_run_whose_updates_were_rolled_back_says_so_and_has_an_exit_code_of_it
 def test_the_policy_whose_update_was_rolled_back_is_named(capfd):
     arguments = [
         *("env=StrikersVsGoalie", "env.num_areas=2", "collect.rounds=20", "ppo.minibatch_size=20"),
-        *("model.hidden=[8]", "log.backends=[]", "hydra.run.dir=run", "export_onnx=false", "max_steps=240"),
+        *("model.hidden=[8]", "log.loggers=[]", "hydra.run.dir=run", "export_onnx=false", "max_steps=240"),
         *("matches.interval=null", "behaviors.Goalie.ppo.lr=1e3", "update_threads=1"),
     ]
     assert train_main(arguments) == 4

@@ -42,7 +42,7 @@ TINY = [
     f"collect.rounds={ROUNDS}",
     "ppo.minibatch_size=60",
     "model.hidden=[16]",
-    "log.backends=[csv]",
+    "log.loggers=[csv]",
 ]
 
 
@@ -52,7 +52,7 @@ def options(iterations, **changes):
         model=ModelConfig(hidden=[16]),
         ppo=PPOConfig(minibatch_size=60),
         collect=CollectConfig(rounds=ROUNDS),
-        log=LogConfig(backends=[], progress=False),
+        log=LogConfig(loggers=[], progress=False),
         max_steps=iterations * BATCH,
         checkpoint_interval=BATCH,
     )
@@ -149,7 +149,7 @@ def test_cuda_without_cuda(tmp_path):
 
 
 def test_stop_at_return_ends_the_run_when_the_mean_holds(tmp_path):
-    outcome = train(options(200, stop_at_return=0.0, log=LogConfig(backends=[], return_window=5)), tmp_path)
+    outcome = train(options(200, stop_at_return=0.0, log=LogConfig(loggers=[], return_window=5)), tmp_path)
     assert outcome.status == "solved"
     assert outcome.agent_steps < 200 * BATCH
     assert outcome.return_mean >= 0.0
@@ -335,7 +335,7 @@ def test_a_training_says_what_the_environment_needs_and_the_trainer_lacks(tmp_pa
 def test_the_folder_is_named_when_the_run_begins(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     small = ["env=Basic", "env.num_areas=2", "collect.rounds=4", "ppo.minibatch_size=4", "export_onnx=false"]
-    lines = [*small, "max_steps=8", "log.backends=[]"]
+    lines = [*small, "max_steps=8", "log.loggers=[]"]
     assert train_main([*lines, "env.params.nothing=1"]) == 2
     captured = capsys.readouterr()
     assert "has no parameter 'nothing'" in captured.err and captured.out == ""

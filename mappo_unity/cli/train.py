@@ -22,8 +22,10 @@ def help_text() -> str:
 def run(lines: list[str]) -> int:
     """Train, resume or sweep as the command line says; return the exit code."""
     from mappo_unity.config.options_file import take_file
+    from mappo_unity.config.renamed import rename_lines
     from mappo_unity.config.text_lines import literal_lines
 
+    lines = rename_lines(lines, lambda text: print(f"mappo-train: {text}", file=sys.stderr))
     options = [line for line in lines if line not in ("-m", "--multirun")]
     is_sweep = len(options) < len(lines)
     lines, file = take_file(literal_lines(options, Config, is_sweep))

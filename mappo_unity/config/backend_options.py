@@ -6,34 +6,12 @@ In: the options that were given, the configurations they led to. Out: nothing, o
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import fields
 from typing import Any
 
 from mappo_unity.config.option_table import show_value
-from mappo_unity.config.schema import Backend, Config, EnvConfig
+from mappo_unity.config.schema import BACKENDS, Backend, Config, EnvConfig
 from mappo_unity.errors import ConfigError
-
-_STARTED = (Backend.player, Backend.registry)
-_UNITY = (Backend.player, Backend.editor, Backend.registry)
-_NEEDED = {
-    "num_areas": (Backend.embedded, *_UNITY),
-    "factory": (Backend.custom,),
-    "file_name": (Backend.player,),
-    "registry": (Backend.registry,),
-    "registry_entry": (Backend.registry,),
-    "num_players": _STARTED,
-    "max_restarts": _UNITY,
-    "timeout_s": _UNITY,
-    "port": (Backend.editor,),
-    "time_scale": _UNITY,
-    "quality_level": _UNITY,
-    "screen_width": _UNITY,
-    "screen_height": _UNITY,
-    "target_frame_rate": _UNITY,
-    "no_graphics": _STARTED,
-    "player_args": _STARTED,
-    "player_logs": _STARTED,
-}
-"""Options of env that other backends do not look at; those of any backend are not here."""
 
 
 def check_effect(given: Iterable[str], configs: list[Config]) -> None:
@@ -47,9 +25,10 @@ def check_effect(given: Iterable[str], configs: list[Config]) -> None:
         ConfigError: naming the backends that look at the option.
     """
     backends = list(dict.fromkeys(config.env.backend for config in configs))
+    looked_at = {item.name: item.metadata.get(BACKENDS) for item in fields(EnvConfig)}
     for key in given:
         section, _, name = key.partition(".")
-        needed = _NEEDED.get(name) if section == "env" else None
+        needed = looked_at.get(name) if section == "env" else None
         if needed is None or set(needed) & set(backends):
             continue
         default = getattr(EnvConfig(), name)

@@ -31,6 +31,7 @@ from mappo_unity.config.overrides import (
 )
 from mappo_unity.config.plain_options import check_form
 from mappo_unity.config.presets import NO_CHOICE, conf_dir, group_choices
+from mappo_unity.config.renamed import rename_keys
 from mappo_unity.config.schema import Config
 from mappo_unity.config.text_lines import key_name, literal_lines
 from mappo_unity.errors import ConfigError
@@ -190,6 +191,7 @@ def _read_options(path: Path) -> dict[Any, Any]:
     missing = [key for key in _ALWAYS_SAVED if key not in saved]
     if missing:
         raise ConfigError(f"{path} is not complete: {' and '.join(missing)} missing")
+    saved = rename_keys(saved)
     for key, value in saved.items():
         try:
             check_value(str(key), value, Config)

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 
 from mappo_unity.config import presets
 from mappo_unity.config.overrides import check_value, given, shell_word
+from mappo_unity.config.renamed import rename_keys
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 
@@ -79,6 +80,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
         raise ConfigError(
             f"{path} holds no options: it must be YAML such as a run's config.yaml, ppo: {{lr: 1e-4}}"
         )
+    saved = rename_keys(saved)
     if saved.pop("resume", None) is not None:
         raise ConfigError(f"{path}: resume belongs on the command line, mappo-train resume=RUN")
     try:

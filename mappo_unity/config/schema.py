@@ -26,6 +26,13 @@ class Backend(Enum):
     registry = "registry"
 
 
+BACKENDS = "backends"
+"""Metadata of an option of env: the backends that look at it; without it all do."""
+_STARTED = {BACKENDS: (Backend.player, Backend.registry)}
+_UNITY = {BACKENDS: (Backend.player, Backend.editor, Backend.registry)}
+_ANY_BUT_CUSTOM = {BACKENDS: (Backend.embedded, Backend.player, Backend.editor, Backend.registry)}
+
+
 class Activation(Enum):
     """Nonlinearity between hidden layers."""
 
@@ -74,7 +81,7 @@ class ValueLoss(Enum):
     mse = "mse"
 
 
-class LogBackend(Enum):
+class LoggerKind(Enum):
     """Where metrics go besides ``metrics.csv``."""
 
     csv = "csv"
@@ -92,41 +99,41 @@ class EnvConfig:
     backend: Backend = Backend.embedded
     """What runs it: an embedded scene, a simulator of your own (custom), a built Unity player, the Unity
     Editor, or a player that ML-Agents' registry names (registry)."""
-    num_areas: Optional[int] = None
+    num_areas: Optional[int] = field(default=None, metadata=_ANY_BUT_CUSTOM)
     """Copies of the playing area inside one environment; null: as many as the Unity scene has."""
     params: dict[str, Any] = field(default_factory=dict)
     """Environment parameters (env.params.mass=2) of the scene or player, or arguments of env.factory."""
-    factory: Optional[str] = None
+    factory: Optional[str] = field(default=None, metadata={BACKENDS: (Backend.custom,)})
     """With backend=custom: package.module:function, called as function(seed=..., **env.params)."""
-    file_name: Optional[str] = None
+    file_name: Optional[str] = field(default=None, metadata={BACKENDS: (Backend.player,)})
     """With backend=player: path of the built Unity player, with or without its extension."""
-    registry: str = "default"
+    registry: str = field(default="default", metadata={BACKENDS: (Backend.registry,)})
     """With backend=registry: path or URL of a registry's YAML file, or default (ML-Agents' own)."""
-    registry_entry: Optional[str] = None
+    registry_entry: Optional[str] = field(default=None, metadata={BACKENDS: (Backend.registry,)})
     """With backend=registry: the entry to play; null: the one called env.name."""
-    num_players: int = 1
+    num_players: int = field(default=1, metadata=_STARTED)
     """Players that run side by side, their agents in one batch."""
-    max_restarts: int = 20
+    max_restarts: int = field(default=20, metadata=_UNITY)
     """Times that each player is started again in a run after it crashed, hung or sent nonsense."""
-    timeout_s: float = 60.0
+    timeout_s: float = field(default=60.0, metadata=_UNITY)
     """Seconds within which a player (or the Editor) must connect, and must answer."""
-    port: Optional[int] = None
+    port: Optional[int] = field(default=None, metadata={BACKENDS: (Backend.editor,)})
     """With backend=editor: the port to wait on; null: 5004, as in Unity. Players get free ports."""
-    time_scale: float = 20.0
+    time_scale: float = field(default=20.0, metadata=_UNITY)
     """How much faster than real time a player runs; a high one may change its physics."""
-    quality_level: Optional[int] = None
+    quality_level: Optional[int] = field(default=None, metadata=_UNITY)
     """Unity's quality level; null: as built."""
-    screen_width: Optional[int] = None
+    screen_width: Optional[int] = field(default=None, metadata=_UNITY)
     """Width of a player's screen in pixels; null: as built."""
-    screen_height: Optional[int] = None
+    screen_height: Optional[int] = field(default=None, metadata=_UNITY)
     """Height of a player's screen in pixels; null: as built."""
-    target_frame_rate: Optional[int] = -1
+    target_frame_rate: Optional[int] = field(default=-1, metadata=_UNITY)
     """Frames a second that a player draws; -1: no limit, null: as built."""
-    no_graphics: bool = False
+    no_graphics: bool = field(default=False, metadata=_STARTED)
     """Start players without graphics (machines without a display); cameras then see nothing."""
-    player_args: list[str] = field(default_factory=list)
+    player_args: list[str] = field(default_factory=list, metadata=_STARTED)
     """Further arguments of a player's command line."""
-    player_logs: Optional[str] = None
+    player_logs: Optional[str] = field(default=None, metadata=_STARTED)
     """Folder of the players' logs; null: players/ in the run's folder."""
     max_team_size: Optional[int] = None
     """Agent slots of a team; null: the largest team seen at the start."""
@@ -336,7 +343,7 @@ class MatchConfig:
 class LogConfig:
     """Metrics and progress."""
 
-    backends: list[LogBackend] = field(default_factory=lambda: [LogBackend.tensorboard])
+    loggers: list[LoggerKind] = field(default_factory=lambda: [LoggerKind.tensorboard])
     """Any of tensorboard, wandb, mlflow, csv (a file for each metric); metrics.csv is always written."""
     project: str = "mappo-unity"
     """Project (wandb) or experiment (mlflow) that the run is filed under."""

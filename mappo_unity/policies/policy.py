@@ -6,17 +6,19 @@ In: the records of a BaseEnv. Out: ActionTuples. Used to play, not to learn.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from mlagents_envs.base_env import ActionSpec, ActionTuple, BehaviorSpec, DecisionSteps
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity import keys
-from mappo_unity.config.schema import Activation, CriticKind, ModelConfig
+from mappo_unity.config.schema import ModelConfig
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.actor_critic import make_actor
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
@@ -185,9 +187,8 @@ def _actor(state: dict[str, Any], name: str) -> Any:
 
 
 def model_from_saved(saved: dict[str, Any]) -> ModelConfig:
-    """Return the model options that a checkpoint holds."""
-    options = dict(saved) | {
-        "activation": Activation(saved["activation"]),
-        "critic": CriticKind(saved["critic"]),
-    }
-    return ModelConfig(**options)
+    """Return the model options that a checkpoint holds; those that it does not know have their defaults."""
+    known = {field.name: saved[field.name] for field in fields(ModelConfig) if field.name in saved}
+    model = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ModelConfig), known))
+    assert isinstance(model, ModelConfig)
+    return model

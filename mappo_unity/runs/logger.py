@@ -22,7 +22,7 @@ from rich.console import Console
 
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.overrides import shell_argument
-from mappo_unity.config.schema import LogBackend, LogConfig
+from mappo_unity.config.schema import LogConfig, LoggerKind
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.metrics_csv import STEP, MetricsFile, keep_until, read_metrics
 from mappo_unity.runs.progress import Progress, current_job
@@ -35,12 +35,12 @@ __all__ = ["RunLog", "check_loggers", "read_metrics"]
 
 def check_loggers(cfg: LogConfig) -> None:
     """Raise ConfigError where a logger's package is not installed; quick, imports nothing."""
-    for backend in (LogBackend.wandb, LogBackend.mlflow):
-        if backend in cfg.backends and importlib.util.find_spec(backend.name) is None:
+    for backend in (LoggerKind.wandb, LoggerKind.mlflow):
+        if backend in cfg.loggers and importlib.util.find_spec(backend.name) is None:
             raise ConfigError(
-                f"log.backends has {backend.name}, but the package {backend.name} is not installed: "
-                f"{install_command(backend.name)}, or leave it out (log.backends=[tensorboard]; "
-                f"choices: {', '.join(choice.name for choice in LogBackend)})"
+                f"log.loggers has {backend.name}, but the package {backend.name} is not installed: "
+                f"{install_command(backend.name)}, or leave it out (log.loggers=[tensorboard]; "
+                f"choices: {', '.join(choice.name for choice in LoggerKind)})"
             )
 
 
@@ -81,7 +81,7 @@ class RunLog:
         self._metrics = MetricsFile(metrics)
         self._excepthook = threading.excepthook
         threading.excepthook = self._on_thread_error
-        self._loggers = [_make_logger(backend, cfg, folder) for backend in dict.fromkeys(cfg.backends)]
+        self._loggers = [_make_logger(backend, cfg, folder) for backend in dict.fromkeys(cfg.loggers)]
 
     def log(self, row: Mapping[str, Any]) -> None:
         """Record a row: numbers by name, with ``agent_steps``; NaN (no episode yet) goes to the CSV only.
@@ -160,15 +160,15 @@ def _plain(value: Any) -> int | float:
     return int(value) if isinstance(value, numbers.Integral) else float(value)
 
 
-def _make_logger(backend: LogBackend, cfg: LogConfig, folder: Path) -> Logger:
+def _make_logger(backend: LoggerKind, cfg: LogConfig, folder: Path) -> Logger:
     from torchrl.record import loggers
 
     name = "/".join(folder.resolve().parts[-2:])
-    if backend is LogBackend.csv:
+    if backend is LoggerKind.csv:
         return loggers.CSVLogger("csv", log_dir=str(folder))
-    if backend is LogBackend.tensorboard:
+    if backend is LoggerKind.tensorboard:
         return loggers.TensorboardLogger("tensorboard", log_dir=str(folder))
-    if backend is LogBackend.wandb:
+    if backend is LoggerKind.wandb:
         return loggers.WandbLogger(
             name, save_dir=str(folder), id=_wandb_id(folder / "wandb_id"), project=cfg.project
         )

@@ -1,0 +1,52 @@
+"""Options that had another name: the old one keeps working on the command line, in files and in runs."""
+
+import pytest
+from omegaconf import OmegaConf
+
+from mappo_unity.cli import train_main
+from mappo_unity.config.compose import load_config
+from mappo_unity.config.renamed import rename_keys, rename_lines
+from mappo_unity.config.schema import Activation, CriticKind, LoggerKind, ModelConfig
+from mappo_unity.policies.policy import model_from_saved
+from mappo_unity.training.resume_check import check_compatible
+
+TINY = [
+    *("env=3DBall", "env.num_areas=4", "collect.rounds=16", "model.hidden=[8]", "max_steps=64"),
+    *("export_onnx=false", "hydra.run.dir=run"),
+]
+
+
+def test_lines_and_keys():
+    notes = []
+    assert rename_lines(["log.backends=[csv]", "++log.backends=[]", "seed=1"], notes.append) == [
+        *("log.loggers=[csv]", "++log.loggers=[]", "seed=1"),
+    ]
+    assert notes == 2 * ["note: log.backends is called log.loggers now"]
+    assert rename_keys({"log": {"backends": ["csv"], "project": "p"}, "seed": 1}) == {
+        "log": {"loggers": ["csv"], "project": "p"},
+        "seed": 1,
+    }
+
+
+def test_the_old_name_keeps_working_with_a_note(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    assert train_main([*TINY, "log.backends=[csv]"]) == 0
+    assert "mappo-train: note: log.backends is called log.loggers now" in capfd.readouterr().err
+    assert load_config(tmp_path / "run/config.yaml").log.loggers == [LoggerKind.csv]
+
+    # a run of an older version
+    saved = OmegaConf.load("run/config.yaml")
+    saved.log.backends = saved.log.pop("loggers")
+    OmegaConf.save(saved, "run/config.yaml")
+    assert load_config(tmp_path / "run/config.yaml").log.loggers == [LoggerKind.csv]
+    assert train_main(["resume=run", "max_steps=128"]) == 0
+
+
+def test_a_checkpoint_that_does_not_know_a_model_option_yet_has_its_default(tmp_path):
+    saved = {"hidden": [8], "critic": "local", "activation": "relu"}
+    wanted = ModelConfig(hidden=[8], critic=CriticKind.local, activation=Activation.relu)
+    assert model_from_saved(saved) == wanted
+    state = {"env_name": "X", "layout": {}, "model": {"P": {"hidden": [8]}}}
+    check_compatible(tmp_path, state, "X", {}, {"P": {"hidden": [8], "init_log_std": 0.0}})
+    with pytest.raises(ValueError, match=r"model.init_log_std=0.0 there, 1.0 here"):
+        check_compatible(tmp_path, state, "X", {}, {"P": {"hidden": [8], "init_log_std": 1.0}})
