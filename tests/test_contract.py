@@ -106,6 +106,10 @@ STARTS = [
     (None, "behavior_specs is None; it must be a mapping"),
     ({"": BehaviorSpec([SENSOR], ACTION)}, "behavior_specs has a name ''; names must be texts"),
     ({"Crew?team=red": BehaviorSpec([SENSOR], ACTION)}, "what follows .team= must be a whole number"),
+    (
+        dict.fromkeys(["Crew?team=1", "Crew"], BehaviorSpec([SENSOR], ACTION)),
+        "behaviors 'Crew' and 'Crew.team=1' share the policy 'Crew': give each a side",
+    ),
     ({NAME: ACTION}, "'Crew.team=0': its spec is a ActionSpec; it must be a BehaviorSpec"),
     ({NAME: BehaviorSpec([], ACTION)}, "'Crew.team=0' has no observation"),
     ({NAME: BehaviorSpec([(3,)], ACTION)}, "observation_specs is .*; it must be a list of ObservationSpec"),

@@ -2,6 +2,7 @@
 
 In: DecisionSteps and TerminalSteps (checked by `record_check`), as many results as a round takes. Out: numpy
 arrays ``[N, ...]`` (N = G * A slots), ready to become tensors. Knows nothing of TensorDict.
+(`np.count_nonzero` asks for flags in a fifth of the time of `any` and `all`.)
 
 A round begins when actions are handed over and ends with the first result in which anybody is
 asked. What arrives in it for a slot is added up: the reward of a terminal step belongs to the row
@@ -124,10 +125,11 @@ class BehaviorRounds:
     def _add_terminal(self, terminal: TerminalSteps) -> None:
         slots = self.slots.lookup(terminal.agent_id)
         own = slots >= 0
-        if own.any():
+        if np.count_nonzero(own):
             own[own] = self.present[slots[own]] & ~self.departed[slots[own]]
-        if not own.all():  # ends of agents that were never asked here: nobody's row
-            if not own.any():
+        count = np.count_nonzero(own)
+        if count < len(own):  # ends of agents that were never asked here: nobody's row
+            if not count:
                 return
             rows = slots[own]
             observations = [o[own] for o in terminal.obs]
@@ -160,7 +162,7 @@ class BehaviorRounds:
         self.group_return[slots] += decision.group_reward
         self.length[slots] += 1
         goes_on = self.present[slots] & ~self.departed[slots]
-        if goes_on.all():
+        if np.count_nonzero(goes_on) == len(goes_on):
             earners, reward, group_reward = slots, decision.reward, decision.group_reward
         else:  # what a first decision brings was earned by no action
             returns = slots[self.departed[slots]]
@@ -172,7 +174,7 @@ class BehaviorRounds:
             reward, group_reward = decision.reward[goes_on], decision.group_reward[goes_on]
         self.reward[earners] += reward
         self.group_reward[earners] += group_reward
-        if self.departed.any():
+        if np.count_nonzero(self.departed):
             self._share_group_reward(slots, decision.group_reward)
         for own, new in zip(self.obs, decision.obs):
             own[slots] = new
@@ -201,7 +203,7 @@ class BehaviorRounds:
 
     def _settle_departed(self, ends: np.ndarray, rows: np.ndarray, group_reward: np.ndarray) -> None:
         """Members that departed earlier earn what this end brought, and end with their team."""
-        if not self.departed.any():
+        if not np.count_nonzero(self.departed):
             return
         self._share_group_reward(rows, group_reward)
         team_ended = np.zeros(self.slots.num_teams, bool)

@@ -219,7 +219,7 @@ class UnityEnv(EnvBase):
 
     def _note_cut_off(self) -> None:
         for name, behavior in self._behaviors.items():
-            if behavior.cut_off.any():
+            if np.count_nonzero(behavior.cut_off):
                 slots = behavior.cut_off.reshape(self._shape(behavior)).copy()
                 self._cut_off.append(CutOff(self.rounds, name, slots))
 
@@ -279,7 +279,10 @@ class UnityEnv(EnvBase):
     @property
     def round_ended(self) -> bool:
         """Whether an episode ended in the last round."""
-        return any(b.terminated.any() or b.truncated.any() for b in self._behaviors.values())
+        for behavior in self._behaviors.values():
+            if np.count_nonzero(behavior.terminated) or np.count_nonzero(behavior.truncated):
+                return True
+        return False
 
     def root(self) -> TensorDict:
         """Return what the agents are asked now: entries as `reset` gives them, ends all False."""

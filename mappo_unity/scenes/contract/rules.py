@@ -60,6 +60,13 @@ def check_specs(specs: Any) -> None:
                 f"behavior {name!r}: its spec is {show_kind(spec)}; it must be a BehaviorSpec"
             )
         _check_spec(name, spec)
+    for name in specs:
+        side = next((other for other in specs if other.startswith(f"{name}?")), None)
+        if side is not None:
+            raise EnvironmentDataError(
+                f"behaviors {name!r} and {side!r} share the policy {name!r}: give each a side of its own, "
+                f"{name}?team=0 and {name}?team=1"
+            )
 
 
 def check_same_specs(specs: Any, first: Mapping[str, BehaviorSpec]) -> None:
