@@ -13,12 +13,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from mappo_unity.config.schema import Backend, Config, EnvConfig, EvalConfig, PlayConfig
+from mappo_unity.config.schema import Backend, Config, EnvConfig, EvalConfig, ExportConfig, PlayConfig
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.first_checks import (
     check_embedded,
     check_environment,
     check_evaluation,
+    check_export,
     check_film,
     check_out,
 )
@@ -236,6 +237,23 @@ def test_a_damaged_best_checkpoint_names_the_others(tmp_path: Path) -> None:
         CheckpointError, match=r"best.pt is damaged.*its run has others: .*step_000000000007.pt$"
     ):
         check_checkpoint(locate(str(run), "run"))
+
+
+def test_what_cannot_be_exported_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    shared = {"SoccerTwos": {"share_parameters": True}}
+    state = {"layout": LAYOUTS["SoccerTwos"], "model": shared}
+    checkpoint.save_in(run, 7, state, keep=2, best=True)
+    check_export(ExportConfig(run=str(run)))
+
+    apart = {"SoccerTwos": {"share_parameters": False}}
+    checkpoint.save_in(run, 9, state | {"model": apart}, keep=2, best=True)
+    with pytest.raises(ConfigError, match="a network for each member of a team cannot be exported"):
+        check_export(ExportConfig(run=str(run)))
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ConfigError, match=r"the package onnxruntime is needed for ONNX files"):
+        check_export(ExportConfig(run=str(run)))
 
 
 def test_a_run_is_found_from_inside_its_folder(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

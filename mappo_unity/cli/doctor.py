@@ -88,9 +88,8 @@ def examine_ports(report: Report, editor_port: int) -> None:
             free.bind(("127.0.0.1", 0))
             report.good(f"free ports for players, for example {free.getsockname()[1]}")
     except OSError as error:
-        report.fail(
-            f"no port of 127.0.0.1 can be had: {error}", "bring the loopback interface up: ip link set lo up"
-        )
+        cure = "bring the loopback interface up: ip link set lo up"
+        report.fail(f"no port of 127.0.0.1 can be had: {error}", cure)
     state = port_state(editor_port)
     if state == "free":
         report.good(f"port {editor_port} (Unity Editor) is free")

@@ -13,13 +13,14 @@ import re
 import shlex
 import subprocess
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override, RangeSweep
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mappo_unity.config.behavior_lines import readable_line
@@ -221,7 +222,7 @@ def _check_type(key: str, value: Any, option: Option, schema: type) -> None:
     _check_size(key, value, option)
     fits = not (option.type is bool and not isinstance(value, bool))
     try:
-        OmegaConf.update(OmegaConf.structured(schema), key, value, merge=True, force_add=option.is_open)
+        OmegaConf.update(_scratch(schema), key, value, merge=True, force_add=option.is_open)
     except (OmegaConfBaseException, ValueError):
         fits = False
     if fits:
@@ -242,6 +243,12 @@ def _check_size(key: str, value: Any, option: Option) -> None:
                 f"{key}={show_value(value)} is out of range: whole numbers are at most {LARGEST} "
                 f"({option.description})"
             )
+
+
+@cache
+def _scratch(schema: type) -> DictConfig:
+    """Return a tree to try values on; what stands in it means nothing. Making one takes 10 ms."""
+    return OmegaConf.structured(schema)
 
 
 def _unknown(key: str, table: dict[str, Option], groups: dict[str, list[str]]) -> str:

@@ -11,6 +11,11 @@ from typing import Any
 from mappo_unity.config.extras import install_command
 from mappo_unity.errors import ConfigError
 
+PER_MEMBER = (
+    "a policy with a network for each member of a team cannot be exported: Unity's Agents of a behavior "
+    "share one model; train with model.share_parameters=true"
+)
+
 
 class ExportError(ConfigError):
     """A policy cannot be exported; the message says which part of it, or what is missing."""

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mappo_unity.config.packages import PER_MEMBER, ExportError, import_package
 from mappo_unity.config.presets import group_choices
 from mappo_unity.config.schema import Backend, Config, EnvConfig, EvalConfig, ExportConfig, PlayConfig
 from mappo_unity.envs.backends import EDITOR_PORT, find_player, make_env_function
@@ -72,7 +73,13 @@ def check_export(cfg: ExportConfig) -> None:
         check_out(cfg.out)
     check_mujoco()
     check_resumable(Path(cfg.run), "run")
-    check_checkpoint(locate(cfg.run, "run"))
+    for package in ("onnx", "onnxruntime"):
+        import_package(package)
+
+    known = check_checkpoint(locate(cfg.run, "run"))
+    for name, layout in known["layout"].items():
+        if layout["team_size"] > 1 and not known["model"][name]["share_parameters"]:
+            raise ExportError(PER_MEMBER)
 
 
 def check_out(out: str) -> None:

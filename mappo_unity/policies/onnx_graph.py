@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from mappo_unity import __version__
 from mappo_unity.config.option_table import with_article
-from mappo_unity.config.packages import ExportError, import_package
+from mappo_unity.config.packages import PER_MEMBER, ExportError, import_package
 from mappo_unity.learning.actor_critic import LOG_STD_RANGE, Actor, PerMember
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import OBS_CLIP, Encoder
@@ -175,10 +175,7 @@ _LAYERS: dict[str, Callable[[_Graph, Any, str, str], str]] = {
 def _check_network(actor: nn.Module) -> Actor:
     """Return an actor all parts of which the graph can hold; anything else is refused."""
     if isinstance(actor, PerMember):
-        raise ExportError(
-            "a policy with a network for each member of a team cannot be exported: Unity's Agents of a "
-            "behavior share one model; train with model.share_parameters=true"
-        )
+        raise ExportError(PER_MEMBER)
     parts = {name: type(part).__name__ for name, part in actor.named_children()}
     if type(actor) is not Actor or parts != {"encoder": "Encoder", "net": "Sequential"}:
         raise ExportError(

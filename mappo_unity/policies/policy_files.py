@@ -12,6 +12,7 @@ import zipfile
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 from mappo_unity.config.overrides import shell_argument
 from mappo_unity.errors import ConfigError
@@ -109,7 +110,7 @@ def choose_checkpoint(run: Path, option: str = "run") -> Path:
     return path
 
 
-def check_checkpoint(source: Source) -> dict[str, object]:
+def check_checkpoint(source: Source) -> dict[str, Any]:
     """Return the plain values of the checkpoint that a source means; raise ConfigError if it is not whole."""
     path = choose_checkpoint(source.path, source.option)
     try:
