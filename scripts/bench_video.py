@@ -35,7 +35,7 @@ class Cost(NamedTuple):
     """Processor time of the whole video."""
 
 
-def film(checkout: Path, scene: str, seconds: float, width: int, height: int) -> tuple[int, int, float]:
+def make_video(checkout: Path, scene: str, seconds: float, width: int, height: int) -> tuple[int, int, float]:
     """Make a video by the code of `checkout`; return frames, bytes and processor seconds."""
     threads = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
@@ -94,8 +94,8 @@ def main() -> None:
         costs: list[list[Cost]] = [[] for _ in checkouts]
         for _ in range(options.repeats):
             for mine, checkout in zip(costs, checkouts, strict=True):  # in turn: a busy machine slows both
-                start_s = film(checkout, scene, 1e-3, *size)[2]
-                frames, size_bytes, total_s = film(checkout, scene, options.seconds, *size)
+                start_s = make_video(checkout, scene, 1e-3, *size)[2]
+                frames, size_bytes, total_s = make_video(checkout, scene, options.seconds, *size)
                 mine.append(Cost(frames, size_bytes, start_s, total_s))
         found = [least(mine) for mine in costs]
         for cost, label in zip(found, ["other", "this"][-len(found) :], strict=True):

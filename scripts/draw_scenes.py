@@ -3,7 +3,7 @@
 
     scripts/draw_scenes.py [SCENE ...] [--out docs/scenes]
 
-Random actions for a few decisions from a fixed seed; needs Pillow and an offscreen OpenGL (README, Films).
+Random actions for a few decisions from a fixed seed; needs Pillow and an offscreen OpenGL (README, Videos).
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from mappo_unity.scenes import make_scene, scene_names
 from mappo_unity.scenes.drawings import drawing_of
 from mappo_unity.viewing.render import Renderer
 
-SIZE = (720, 450)
+SIZE = (720, 408)  # the shape of a video
 LARGEST = 60_000  # bytes
 MOMENTS = {
     "3DBall": (0, 4),
     "Basic": (0, 3),
     "DungeonEscape": (4, 8),
-    "GridFoodCollector": (0, 28),
-    "Hallway": (1, 6),
-    "Pyramids": (3, 10),
+    "GridFoodCollector": (20, 28),
+    "Hallway": (36, 10),
+    "Pyramids": (32, 10),
     "SoccerTwos": (1, 12),
     "StrikersVsGoalie": (2, 12),
     "WallJump": (0, 6),

@@ -98,7 +98,7 @@ def test_a_folder_of_onnx_files_plays_every_behavior(shared: Path) -> None:
 def test_a_window_shows_frames_at_their_time() -> None:
     start = time.monotonic()
     with Window(CAMERA, SIZE, fps=20, title="test") as window:
-        assert all(window.show([ball((0, 0, 0), 1.0, RED)], CAMERA) for _ in range(10))
+        assert all(window.show([ball((0, 0, 0), 1.0, RED)], CAMERA, ["a", f"{i} s"]) for i in range(10))
     assert time.monotonic() - start > 0.4
 
 

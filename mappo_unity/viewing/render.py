@@ -39,7 +39,7 @@ _STAGE = """
   <visual>
     <global fovy="{fovy}" offwidth="{width}" offheight="{height}"/>
     <headlight ambient="0.32 0.32 0.34" diffuse="0.28 0.28 0.28" specular="0 0 0"/>
-    <quality shadowsize="2048" offsamples="0" numslices="20" numstacks="10"/>
+    <quality shadowsize="1024" offsamples="0" numslices="20" numstacks="10"/>
     <map znear="0.02" zfar="20" shadowclip="1.1"/>
   </visual>
   <statistic extent="{extent}" center="{center}"/>

@@ -130,3 +130,16 @@ def test_rotations_are_unitys() -> None:
 def test_an_unknown_scene_has_no_drawing() -> None:
     with pytest.raises(ConfigError, match="no drawing of a scene '4DBall'; choices: 3DBall, Basic"):
         drawing_of("4DBall")
+
+
+def test_in_pyramids_the_camera_looks_towards_what_the_agent_has_to_reach() -> None:
+    scene = played("Pyramids")
+    follow = drawing_of("Pyramids").camera
+    assert isinstance(follow, Follow)
+    scene.bodies.position[1] = (1.0, 0.5, 2.0)
+    scene.bodies.switch_position[1] = (31.0, 2.0, 2.0)
+    np.testing.assert_allclose(follow.place(scene, 1), (9.0, 0.0, 2.0))  # 8 m towards the switch
+    scene.switch_on[1] = True
+    scene.bricks.appear(np.array([1]), scene.brick_spot[1:])
+    scene.bricks.bodies[1, -1, :3] = (1.0, 3.0, -8.0)
+    np.testing.assert_allclose(follow.place(scene, 1), (1.0, 0.0, -2.0))  # two fifths of the way to the goal

@@ -60,7 +60,7 @@ class Scene(SceneHooks, BaseEnv):
         self._asked = np.zeros(0, np.int64)
         self._asked_rows: list[np.ndarray] = [self._asked for _ in self.BEHAVIORS]
         self.counter = 0  # the academy's step count: ticks since the start or the last env.reset()
-        self.after_tick: Callable[[], None] | None = None  # called at the end of every tick, to film it
+        self.after_tick: Callable[[], None] | None = None  # called at the end of every tick, to show it
         self._closed = False
 
     # ---- what hooks call --------------------------------------------------------------------------------

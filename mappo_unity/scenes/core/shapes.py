@@ -185,7 +185,8 @@ def floor_lines(half: float, spacing: float, width: float, color: Color, top: fl
     ends = half - half % spacing
     lines = np.arange(-ends, ends + spacing / 2, spacing)
     along_z = [box((x, top, 0), (width / 2, 0.004, half), color, shadow=False) for x in lines]
-    along_x = [box((0, top, z), (half, 0.004, width / 2), color, shadow=False) for z in lines]
+    # Not as high as the others: what has two surfaces at one place is lit twice.
+    along_x = [box((0, top, z), (half, 0.002, width / 2), color, shadow=False) for z in lines]
     return along_z + along_x
 
 

@@ -64,9 +64,13 @@ def _standing(wall: np.ndarray, top: float) -> Shape:
 
 
 def followed(scene: Pyramids, area: int) -> np.ndarray:
-    """Return where the agent is, on the floor."""
-    return scene.bodies.position[area] * [1, 0, 1]
+    """Return a place on the floor up to 8 m from the agent, towards what it has to reach next."""
+    bodies, bricks = scene.bodies, scene.bricks
+    goal = bodies.switch_position[area] if bricks.mode[area] == ABSENT else bricks.bodies[area, -1, :3]
+    way = (goal - bodies.position[area]) * [1, 0, 1]
+    lead = min(8.0, 0.4 * float(np.linalg.norm(way)))
+    return bodies.position[area] * [1, 0, 1] + way * lead / max(float(np.linalg.norm(way)), 1e-6)
 
 
-VIEW = Camera((0.0, 0.0, 0.0), 38.0, yaw=0.0, pitch=54.0)
+VIEW = Camera((0.0, 0.0, 0.0), 42.0, yaw=0.0, pitch=54.0)
 DRAWING = Drawing(shapes, Follow(VIEW, followed, reach=(35.0, 40.0)))
