@@ -20,7 +20,7 @@ from mappo_unity.policies.policy import Policy
 from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes.core.scene import Scene
 from mappo_unity.scenes.core.shapes import Camera, Drawing, Follow, Shape
-from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.scenes.registry import drawing_of
 from mappo_unity.signals import termination_as_interrupt
 from mappo_unity.viewing.camera import MovingCamera
 from mappo_unity.viewing.caption import Tally
