@@ -17,30 +17,17 @@ import numpy as np
 from PIL import Image
 
 from mappo_unity.policies.policy import RandomPolicy
-from mappo_unity.scenes import make_scene, scene_names
-from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.scenes import make_scene
+from mappo_unity.scenes.registry import BUILT_IN, drawing_of
 from mappo_unity.viewing.render import Renderer
 
 SIZE = (720, 408)  # the shape of a video
 LARGEST = 60_000  # bytes
-MOMENTS = {
-    "3DBall": (0, 4),
-    "Basic": (0, 3),
-    "DungeonEscape": (4, 8),
-    "GridFoodCollector": (20, 28),
-    "Hallway": (36, 10),
-    "Pyramids": (32, 10),
-    "SoccerTwos": (1, 12),
-    "StrikersVsGoalie": (2, 12),
-    "WallJump": (0, 6),
-    "Walker": (3, 3),
-}
-"""Seed and decisions played before the picture; (0, 8) for a scene that is not named."""
 
 
 def played(name: str) -> Any:
     """Return one area of a scene after its moment."""
-    seed, decisions = MOMENTS.get(name, (0, 8))
+    seed, decisions = BUILT_IN[name].picture
     scene: Any = make_scene(name, seed=seed, num_areas=1)
     policy = RandomPolicy(seed)
     scene.reset()
@@ -84,7 +71,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scenes", nargs="*", default=scene_names(), help="default: all")
+    parser.add_argument("scenes", nargs="*", default=list(BUILT_IN), help="default: all")
     default = Path(__file__).resolve().parents[1] / "docs" / "scenes"
     parser.add_argument("--out", type=Path, default=default)
     options = parser.parse_args()

@@ -2,7 +2,8 @@
 
 In: a scene, whose hooks are watched while somebody plays it. Out: the lowest and highest values seen, and
 faults. Constants are those of Unity's scenes (docs/scenes/), typed here once more and not read from the
-scenes' modules, so that a slip there is found here. Used by `soak_scenes.py`.
+scenes' modules, so that a slip there is found here. `soak_scenes.py` finds a scene's class by its
+record (`mappo_unity/scenes/registry.py`).
 
 Coordinates as in the scenes: x right, y up, z forward, metres. Legend: n begun episodes, N areas.
 """
@@ -604,21 +605,6 @@ class Pyramids(Ranges):
 
     def _spot(self, rows: np.ndarray) -> np.ndarray:
         return np.asarray(self.scene.brick_spot[rows])
-
-
-RANGES: dict[str, type[Ranges]] = {
-    "3DBall": Ball3D,
-    "Basic": Basic,
-    "Walker": Walker,
-    "GridFoodCollector": GridFoodCollector,
-    "SoccerTwos": SoccerTwos,
-    "StrikersVsGoalie": StrikersVsGoalie,
-    "DungeonEscape": DungeonEscape,
-    "Hallway": Hallway,
-    "WallJump": WallJump,
-    "Pyramids": Pyramids,
-}
-"""The checks of every scene."""
 
 
 def square_gap(offset: np.ndarray, turn: np.ndarray, half: tuple[float, float], square: float) -> np.ndarray:

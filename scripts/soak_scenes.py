@@ -32,10 +32,11 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps  # noqa: E402
-from scene_ranges import RANGES, Seen  # noqa: E402
+from scene_ranges import Seen  # noqa: E402
 
-from mappo_unity.scenes import make_scene, scene_names  # noqa: E402
+from mappo_unity.scenes import make_scene  # noqa: E402
 from mappo_unity.scenes.contract.play import random_actions  # noqa: E402
+from mappo_unity.scenes.registry import BUILT_IN, ranges_of  # noqa: E402
 
 TICK_S = {"Walker": 0.01333}  # others 0.02
 WARM_UP = 0.25  # of the time
@@ -98,7 +99,7 @@ def soak(scene: str, hours: float, num_areas: int, seed: int = 0) -> Report:
     before = np.seterr(divide="call", over="call", invalid="call")
     caller = np.seterrcall(lambda kind, flag: warnings.update([f"numpy: {kind}"]))
     env = make_scene(scene, seed=seed, num_areas=num_areas)
-    ranges = RANGES[scene](env)
+    ranges = ranges_of(scene)(env)
     start = time.process_time()
     try:
         _play(env, ranges, report, round(hours * 3600 / TICK_S.get(scene, 0.02)), RandomPlay(seed))
@@ -193,7 +194,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--scenes", nargs="+", default=scene_names(), choices=scene_names(), metavar="SCENE")
+    parser.add_argument(
+        "--scenes", nargs="+", default=list(BUILT_IN), choices=list(BUILT_IN), metavar="SCENE"
+    )
     parser.add_argument("--hours", type=float, default=2.0, help="of simulated time in each scene")
     parser.add_argument("--num-areas", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)

@@ -18,8 +18,9 @@ from mappo_unity.policies.episodes import summarize
 from mappo_unity.policies.evaluate import play
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.runs import checkpoint
-from mappo_unity.scenes import make_scene, scene_names
+from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.contract.check import check_env
+from mappo_unity.scenes.registry import BUILT_IN
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.trainer import Outcome, train
 
@@ -39,7 +40,7 @@ TINY = [
     "max_steps=1000000",
 ]
 
-every_scene = pytest.mark.parametrize("name", scene_names())
+every_scene = pytest.mark.parametrize("name", BUILT_IN)
 
 
 @every_scene

@@ -11,7 +11,7 @@ from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.core.shapes import Camera, Drawing, Follow
-from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.scenes.registry import drawing_of
 from mappo_unity.viewing.camera import LAG_S, MovingCamera
 from mappo_unity.viewing.caption import Tally
 

@@ -25,7 +25,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.policies.onnx_policy import OnnxFolder
 from mappo_unity.runs import folder as runs
 from mappo_unity.scenes.core.shapes import RED, ball
-from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.scenes.registry import drawing_of
 from mappo_unity.viewing.play import Pace, open_scene, play, policy_of
 from mappo_unity.viewing.window import Window
 

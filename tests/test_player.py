@@ -21,7 +21,8 @@ from mappo_unity.protocol import decode, encode, messages
 from mappo_unity.protocol.batch_encoding import varint_columns
 from mappo_unity.protocol.player_log import PlayerLog
 from mappo_unity.protocol.serve import Player, env_function, play, serve
-from mappo_unity.scenes import make_scene, scene_names
+from mappo_unity.scenes import make_scene
+from mappo_unity.scenes.registry import BUILT_IN
 
 from mlagents_envs.base_env import (  # isort: skip  # mappo_unity lets it import
     ActionSpec,
@@ -286,7 +287,7 @@ class TestOtherClients:
             env.close()
 
 
-@pytest.mark.parametrize("scene", scene_names())
+@pytest.mark.parametrize("scene", BUILT_IN)
 def test_every_scene_passes_through_the_wire_unchanged(scene: str) -> None:
     """The player's bytes, decoded, are the embedded scene's steps, to the bit; actions come back as sent."""
     areas = 1 if scene in ("SoccerTwos", "GridFoodCollector", "Pyramids") else None

@@ -50,12 +50,19 @@ def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv
 
 
 def _embedded(cfg: EnvConfig) -> MakeEnv:
-    from mappo_unity.scenes import make_scene
+    from mappo_unity.scenes.registry import BUILT_IN, make_scene
 
     params = dict(cfg.params)
     if cfg.num_areas is not None:
         params["num_areas"] = cfg.num_areas
-    return lambda seed: make_scene(cfg.name, seed=seed, **params)
+
+    def make(seed: int) -> BaseEnv:
+        scene = make_scene(cfg.name, seed=seed, **params)
+        if cfg.name in BUILT_IN:
+            return scene
+        return GuardedEnv(scene, f"scene {cfg.name}", explain_error)  # what it raises is its author's to mend
+
+    return make
 
 
 def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:

@@ -6,21 +6,19 @@ In: `PlayConfig`. Out: a video, and what was played as a dict. Prints nothing, l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
 from mappo_unity.config.schema import PlayConfig
-from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.policies.first_checks import check_embedded
 from mappo_unity.policies.policy import Policy
 from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes.core.scene import Scene
 from mappo_unity.scenes.core.shapes import Camera, Drawing, Follow, Shape
-from mappo_unity.scenes.drawings import drawing_of
+from mappo_unity.scenes.registry import drawing_of, make_scene
 from mappo_unity.signals import termination_as_interrupt
 from mappo_unity.viewing.camera import MovingCamera
 from mappo_unity.viewing.caption import Tally
@@ -75,9 +73,7 @@ def open_scene(cfg: PlayConfig) -> Scene:
     """Open one area of the scene that a run was trained in, or that `cfg.env` names."""
     options = config_to_play(Path(cfg.run or ""), cfg.env).env
     check_embedded(options)
-    scene = make_env_function(replace(options, num_areas=1))(cfg.seed)
-    assert isinstance(scene, Scene)
-    return scene
+    return make_scene(options.name, seed=cfg.seed, **{**options.params, "num_areas": 1})
 
 
 def policy_of(cfg: PlayConfig, scene: Scene) -> Policy:

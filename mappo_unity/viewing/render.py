@@ -1,6 +1,6 @@
 """Pictures of shapes, by MuJoCo's renderer, offscreen or in a window.
 
-In: shapes and a camera (scenes/drawings). Out: frames uint8 [height, width, 3]. Knows no scene: the shapes
+In: shapes and a camera (scenes/core/shapes). Out: frames uint8 [height, width, 3]. Knows no scene: shapes
 go straight into the renderer's list, so nothing has to be simulated by MuJoCo to be drawn.
 
 MuJoCo's world is right-handed with z up, Unity's left-handed with y up; swapping y and z turns one into the

@@ -10,7 +10,7 @@ import pytest
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.policy import RandomPolicy
-from mappo_unity.scenes import make_scene, scene_names
+from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.core.shapes import (
     BLUE,
     GREEN,
@@ -25,8 +25,8 @@ from mappo_unity.scenes.core.shapes import (
     quaternion_rotation,
     yaw_rotation,
 )
-from mappo_unity.scenes.drawings import drawing_of
 from mappo_unity.scenes.grid_food_collector.drawing import FROZEN_COLOR
+from mappo_unity.scenes.registry import BUILT_IN, drawing_of
 
 
 def played(name: str, decisions: int = 3) -> Any:
@@ -50,7 +50,7 @@ def check_shape(shape: Shape) -> None:
     assert np.linalg.det(shape.rotation) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_every_scene_has_a_drawing_of_sound_shapes_in_its_view(name: str) -> None:
     scene, drawing = played(name), drawing_of(name)
     for area in (0, 1):
@@ -64,7 +64,7 @@ def test_every_scene_has_a_drawing_of_sound_shapes_in_its_view(name: str) -> Non
     assert drawing.tick_s > 0
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_agents_are_large_enough_to_be_seen(name: str) -> None:
     scene, drawing = played(name), drawing_of(name)
     agents = [

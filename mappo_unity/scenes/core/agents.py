@@ -82,6 +82,11 @@ class Agents:
             )
         return self._members
 
+    def enabled_slots(self, slots: np.ndarray) -> np.ndarray:
+        """Return those of `slots` (integers, or a mask over all slots) whose agents are enabled."""
+        slots = as_slots(slots)
+        return slots[self.enabled[slots]]
+
     def count_tick(self) -> None:
         """Count one tick of every agent's episode."""
         self.step_count = self.step_count + self._one_tick
@@ -146,3 +151,9 @@ class Agents:
     def _forget_order(self) -> None:
         self._order = None
         self._members = None
+
+
+def as_slots(slots: np.ndarray) -> np.ndarray:
+    """Return slots as integers, whether they are integers or a mask bool over all slots."""
+    slots = np.asarray(slots)
+    return np.flatnonzero(slots) if slots.dtype == bool else slots.reshape(-1)

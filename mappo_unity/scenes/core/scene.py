@@ -1,38 +1,60 @@
 """The stepping loop that every embedded scene stands on: Unity ML-Agents' framework rules, vectorised.
 
-In: a scene's declarations and hooks (`hooks.py` says how to write a scene). Out: a
-`mlagents_envs.base_env.BaseEnv`. Knows no scene.
+In: a scene's declarations and hooks (../README.md says how to write a scene). Out: a
+`mlagents_envs.base_env.BaseEnv`. Knows no scene. `tick` says in what order the hooks are called.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
-from mlagents_envs.base_env import (
-    ActionTuple,
-    BaseEnv,
-    BehaviorMapping,
-    DecisionSteps,
-    TerminalSteps,
-)
-from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
+from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
+from mlagents_envs.exception import UnityEnvironmentException
 
 from mappo_unity.errors import ConfigError
-from mappo_unity.scenes.core.action_check import ActionCheck
-from mappo_unity.scenes.core.agents import Agents
-from mappo_unity.scenes.core.hooks import SceneHooks
+from mappo_unity.scenes.core.agents import Agents, as_slots
+from mappo_unity.scenes.core.exchange import Exchange
 from mappo_unity.scenes.core.records import Records, steps_from_state, steps_state
-from mappo_unity.scenes.core.specs import at_least_one, checked_parameter, checked_seed
+from mappo_unity.scenes.core.specs import (
+    Behavior,
+    Parameter,
+    at_least_one,
+    checked_parameter,
+    checked_seed,
+)
+from mappo_unity.scenes.core.tick import finish_tick, run_to_exchange
 
 
-class Scene(SceneHooks, BaseEnv):
+class Scene(BaseEnv):
     """Run N areas of a Unity example scene under ML-Agents' rules, without Unity.
 
     Arguments of every scene: `num_areas` copies of the playing area (None: as many as Unity's scene),
     `num_threads` for physics, `seed` of the one random generator `self.rng`, and environment parameters.
     """
+
+    NAME: ClassVar[str]
+    """Name of the scene."""
+    DEFAULT_NUM_AREAS: ClassVar[int] = 1
+    """Areas of the Unity scene."""
+    BEHAVIORS: ClassVar[tuple[Behavior, ...]]
+    """Behaviors, in the order in which Unity lists them."""
+    AREA_BEHAVIORS: ClassVar[tuple[int, ...]] = (0,)
+    """First behavior (index) of each agent of an area; the order gives the agent ids."""
+    AREA_GROUPS: ClassVar[tuple[int, ...]] = (-1,)
+    """Group of each agent of an area, from 0 in creation order; -1: none (group id 0)."""
+    DECISION_PERIOD: ClassVar[int] = 5
+    """Ticks between two decisions."""
+    TAKE_ACTIONS_BETWEEN_DECISIONS: ClassVar[bool] = True
+    """Whether `act` runs every tick, or only in ticks of a decision."""
+    MAX_STEP: ClassVar[int] = 0
+    """Ticks after which an agent's episode is interrupted; 0: never."""
+    PARAMETERS: ClassVar[Mapping[str, Parameter]] = {}
+    """Environment parameters that the scene reads."""
+
+    counter: int
+    """Ticks of the academy since the start or the last env.reset()."""
 
     def __init__(
         self, *, num_areas: int | None = None, num_threads: int = 1, seed: int = 0, **parameters: float
@@ -40,14 +62,12 @@ class Scene(SceneHooks, BaseEnv):
         self.num_areas = at_least_one("num_areas", num_areas or self.DEFAULT_NUM_AREAS, num_areas)
         self.num_threads = at_least_one("num_threads", num_threads, num_threads)
         self.rng = np.random.default_rng(checked_seed(seed))
-        self.agents_per_area = len(self.AREA_BEHAVIORS)
-        self.num_slots = self.num_areas * self.agents_per_area
         self.parameters = {name: known.default for name, known in self.PARAMETERS.items()}
         for name, value in parameters.items():
             self.parameters[name] = checked_parameter(self.NAME, self.PARAMETERS, name, value)
-        self._specs = BehaviorMapping({behavior.name: behavior.spec() for behavior in self.BEHAVIORS})
-        self._checks = [ActionCheck(behavior) for behavior in self.BEHAVIORS]
-        self._index = {behavior.name: i for i, behavior in enumerate(self.BEHAVIORS)}
+
+        self.agents_per_area = len(self.AREA_BEHAVIORS)
+        self.num_slots = self.num_areas * self.agents_per_area
         self.agents = Agents(
             np.tile(np.array(self.AREA_BEHAVIORS), self.num_areas),
             self.home_groups(),
@@ -55,13 +75,59 @@ class Scene(SceneHooks, BaseEnv):
             max(behavior.continuous for behavior in self.BEHAVIORS),
             max(len(behavior.branches) for behavior in self.BEHAVIORS),
         )
-        self._records = Records(self.BEHAVIORS, self.agents)
-        self._results: list[tuple[DecisionSteps, TerminalSteps]] = []
-        self._asked = np.zeros(0, np.int64)
-        self._asked_rows: list[np.ndarray] = [self._asked for _ in self.BEHAVIORS]
-        self.counter = 0  # the academy's step count: ticks since the start or the last env.reset()
+        self.records = Records(self.BEHAVIORS, self.agents)
+        self.exchange = Exchange(self.NAME, self.BEHAVIORS, self.agents)
+
+        self.counter = 0
         self.after_tick: Callable[[], None] | None = None  # called at the end of every tick, to show it
         self._closed = False
+
+    # ---- hooks: what a scene is written with -------------------------------------------------------------
+
+    def begin_episode(self, slots: np.ndarray) -> None:
+        """Begin new episodes of `slots` (OnEpisodeBegin); draw from `self.rng` here."""
+        raise NotImplementedError
+
+    def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
+        """Return a new list: for each sensor a new array float32 ``[len(slots), *shape]``, not stacked."""
+        raise NotImplementedError
+
+    def observe_all(self, slots: list[np.ndarray]) -> list[list[np.ndarray]]:
+        """Return what `observe` does for `slots` of every behavior; override to save work in common."""
+        if len(slots) == 1:
+            return [self.observe(0, slots[0])]
+        return [self.observe(behavior, rows) if rows.size else [] for behavior, rows in enumerate(slots)]
+
+    def act(self, slots: np.ndarray) -> None:
+        """Execute the stored actions of `slots`; give rewards, end episodes (OnActionReceived)."""
+        raise NotImplementedError
+
+    def simulate(self) -> None:
+        """Advance physics by one tick, then handle contacts; those may end episodes too."""
+
+    def fixed_update(self) -> None:
+        """Run the agents' own FixedUpdate, before the academy's step of this tick."""
+
+    def controllers(self) -> None:
+        """Run scripts that follow the academy's step (area timers), before physics."""
+
+    def decides(self) -> bool | np.ndarray:
+        """Return who asks for a decision this tick: all, none, or a mask bool over slots."""
+        return self.counter % self.DECISION_PERIOD == 0
+
+    def action_mask(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
+        """Return one bool ``[len(slots), branch size]`` a discrete branch, True = forbidden."""
+        return [np.zeros((len(slots), size), bool) for size in self.BEHAVIORS[behavior].branches]
+
+    def parameter_changed(self, name: str) -> None:
+        """Apply a parameter that acts at once (gravity); others are read at the next reset."""
+
+    def scene_state(self) -> dict[str, Any]:
+        """Return everything of the scene that a snapshot needs, as numpy arrays and plain values."""
+        return {}
+
+    def load_scene_state(self, state: dict[str, Any]) -> None:
+        """Restore what `scene_state` returned."""
 
     # ---- what hooks call --------------------------------------------------------------------------------
 
@@ -83,7 +149,7 @@ class Scene(SceneHooks, BaseEnv):
         Serves EndEpisode, EndGroupEpisode (pass all slots of the group) and, with `interrupted`, their
         time limits. An agent that already ended since its last decision sends no second record.
         """
-        slots = self._enabled_slots(slots)
+        slots = self.agents.enabled_slots(slots)
         if slots.size:
             self._send_terminals(slots, interrupted)
             self.agents.clear_actions(slots)
@@ -92,7 +158,7 @@ class Scene(SceneHooks, BaseEnv):
 
     def disable(self, slots: np.ndarray) -> None:
         """Disable agents: terminal records (not interrupted), then they leave their groups."""
-        slots = self._enabled_slots(slots)
+        slots = self.agents.enabled_slots(slots)
         self._send_terminals(slots, False)
         self.agents.disable(slots)
 
@@ -101,12 +167,13 @@ class Scene(SceneHooks, BaseEnv):
 
         `group_ids`: a group id a slot (`home_groups()[slots]`: as at the start) or one for all.
         """
-        slots = _as_slots(slots)
+        slots = as_slots(slots)
         keep = ~self.agents.enabled[slots]
         slots = slots[keep]
+
         if slots.size:
             self.agents.enable(slots, group_ids[keep] if isinstance(group_ids, np.ndarray) else group_ids)
-            self._records.clear_stacks(slots)
+            self.records.clear_stacks(slots)
             if self.started:
                 self.begin_episode(slots)
 
@@ -116,7 +183,7 @@ class Scene(SceneHooks, BaseEnv):
         An agent that has not ended since its last decision sends a terminal record under its old
         behavior, not interrupted; no episode begins. `behavior`: an index, or one a slot.
         """
-        slots = _as_slots(slots)
+        slots = as_slots(slots)
         behavior = np.broadcast_to(behavior, slots.shape)
         keep = self.agents.enabled[slots]
         self._send_terminals(slots[keep], False)
@@ -131,14 +198,14 @@ class Scene(SceneHooks, BaseEnv):
     @property
     def started(self) -> bool:
         """Whether the first env.reset() has happened."""
-        return bool(self._results)
+        return bool(self.exchange.results)
 
     # ---- BaseEnv ----------------------------------------------------------------------------------------
 
     @property
     def behavior_specs(self) -> BehaviorMapping:
         """Return the specs of all behaviors, complete from the start."""
-        return self._specs
+        return self.exchange.specs
 
     def reset(self) -> None:
         """Reset as Unity's academy does: the first time tick 0, later at the exchange of a running tick.
@@ -153,16 +220,16 @@ class Scene(SceneHooks, BaseEnv):
             slots = self.agents.order
             self.agents.clear_actions(slots)
             self.begin_episode(slots)
-            self._finish_tick()
-        self._run_to_exchange()
+            finish_tick(self)
+        run_to_exchange(self)
 
     def step(self) -> None:
         """Go on until some agent reports: asks for a decision, or has ended."""
         self._check_open()
         if not self.started:
             return self.reset()
-        self._finish_tick()
-        self._run_to_exchange()
+        finish_tick(self)
+        run_to_exchange(self)
 
     def close(self) -> None:
         """Release the scene; further steps are an error."""
@@ -170,27 +237,15 @@ class Scene(SceneHooks, BaseEnv):
 
     def get_steps(self, behavior_name: str) -> tuple[DecisionSteps, TerminalSteps]:
         """Return the decision and terminal steps of the last exchange."""
-        behavior = self._behavior(behavior_name)
-        if not self.started:
-            raise UnityActionException(f"behavior {behavior_name} has no steps yet: call reset() first")
-        return self._results[behavior]
+        return self.exchange.get_steps(behavior_name)
 
     def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
         """Set the actions of all agents in the last decision steps, in their order."""
-        behavior = self._behavior(behavior_name)
-        slots = self._asked_rows[behavior]
-        self._checks[behavior](action, self.agents.agent_id[slots])
-        self.agents.store_actions(slots, action.continuous, action.discrete)
+        self.exchange.set_actions(behavior_name, action)
 
     def set_action_for_agent(self, behavior_name: str, agent_id: int, action: ActionTuple) -> None:
         """Set the action of one agent in the last decision steps; those never set act with zeros."""
-        behavior = self._behavior(behavior_name)
-        slots = self._asked_rows[behavior]
-        slot = slots[self.agents.agent_id[slots] == agent_id]
-        if not slot.size:
-            raise IndexError(f"agent {agent_id} of {behavior_name} did not request a decision")
-        self._checks[behavior](action, self.agents.agent_id[slot])
-        self.agents.store_actions(slot, action.continuous, action.discrete)
+        self.exchange.set_action_for_agent(behavior_name, agent_id, action)
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set an environment parameter; the scene's sheet says when it takes effect."""
@@ -208,9 +263,9 @@ class Scene(SceneHooks, BaseEnv):
             "rng": self.rng.bit_generator.state,
             "parameters": dict(self.parameters),
             "agents": self.agents.get_state(),
-            "stacks": self._records.get_state(),
-            "asked": self._asked.copy(),
-            "results": [[steps_state(d), steps_state(t)] for d, t in self._results],
+            "stacks": self.records.get_state(),
+            "asked": self.exchange.asked.copy(),
+            "results": [[steps_state(d), steps_state(t)] for d, t in self.exchange.results],
             "state": self.scene_state(),
         }
 
@@ -226,57 +281,10 @@ class Scene(SceneHooks, BaseEnv):
         self.rng.bit_generator.state = state["rng"]
         self.parameters = dict(state["parameters"])
         self.agents.set_state(state["agents"])
-        self._records.set_state(state["stacks"])
-        self._results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]
-        self._set_asked(state["asked"].copy())
+        self.records.set_state(state["stacks"])
+        self.exchange.results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]
+        self.exchange.ask(state["asked"].copy())
         self.load_scene_state(state["state"])
-
-    # ---- the tick ---------------------------------------------------------------------------------------
-
-    def _run_to_exchange(self) -> None:
-        while not self._begin_tick():
-            self._finish_tick()
-
-    def _begin_tick(self) -> bool:
-        """Run a tick up to the exchange with Python; return whether there is one."""
-        agents = self.agents
-        self.fixed_update()
-        if not self.started:
-            self.begin_episode(agents.order)
-        decides = self.decides()
-        if decides is True:
-            self._set_asked(agents.order)
-        else:
-            self._set_asked(agents.order[:0] if decides is False else agents.order[decides[agents.order]])
-        self.counter += 1
-        agents.count_tick()
-        if not self._asked.size and not len(self._records) and self.started:
-            return False
-        frames = self.observe_all(self._asked_rows) if self._asked.size else [[] for _ in self.BEHAVIORS]
-        self._results = list(map(self._result, range(len(frames)), frames))
-        agents.clear_actions(self._asked)
-        return True
-
-    def _finish_tick(self) -> None:
-        """Run a tick from the exchange with Python to its end."""
-        slots = self.agents.order if self.TAKE_ACTIONS_BETWEEN_DECISIONS else self._asked
-        if slots.size:
-            self.act(slots)
-        if self.MAX_STEP:
-            late = self.agents.step_count >= self.MAX_STEP
-            if np.count_nonzero(late):
-                self.end_episode(late, interrupted=True)
-        self.controllers()
-        self.simulate()
-        if self.after_tick is not None:
-            self.after_tick()
-
-    def _result(self, behavior: int, frames: list[np.ndarray]) -> tuple[DecisionSteps, TerminalSteps]:
-        slots = self._asked_rows[behavior]
-        discrete = self.BEHAVIORS[behavior].branches and slots.size
-        mask = self.action_mask(behavior, slots) if discrete else None
-        decisions = self._records.decisions(behavior, slots, frames, mask)
-        return decisions, self._records.take_terminals(behavior)
 
     def _send_terminals(self, slots: np.ndarray, interrupted: bool) -> None:
         agents = self.agents
@@ -284,37 +292,8 @@ class Scene(SceneHooks, BaseEnv):
         for behavior in range(len(self.BEHAVIORS)):
             rows = slots if len(self.BEHAVIORS) == 1 else slots[agents.behavior[slots] == behavior]
             if rows.size:
-                self._records.end(behavior, rows, self.observe(behavior, rows), interrupted)
-
-    def _set_asked(self, slots: np.ndarray) -> None:
-        self._asked = slots
-        if slots is self.agents.order:
-            self._asked_rows = self.agents.members
-        elif not slots.size:
-            self._asked_rows = [slots] * len(self.BEHAVIORS)
-        else:
-            self._asked_rows = [slots[self.agents.behavior[slots] == i] for i in range(len(self.BEHAVIORS))]
-
-    # ---- checks -----------------------------------------------------------------------------------------
-
-    def _enabled_slots(self, slots: np.ndarray) -> np.ndarray:
-        slots = _as_slots(slots)
-        return slots[self.agents.enabled[slots]]
-
-    def _behavior(self, name: str) -> int:
-        try:
-            return self._index[name]
-        except KeyError:
-            known = list(self._index)
-            raise UnityActionException(
-                f"scene {self.NAME} has no behavior {name!r}; it has {known}"
-            ) from None
+                self.records.end(behavior, rows, self.observe(behavior, rows), interrupted)
 
     def _check_open(self) -> None:
         if self._closed:
             raise UnityEnvironmentException(f"scene {self.NAME} is closed")
-
-
-def _as_slots(slots: np.ndarray) -> np.ndarray:
-    slots = np.asarray(slots)
-    return np.flatnonzero(slots) if slots.dtype == bool else slots.reshape(-1)
