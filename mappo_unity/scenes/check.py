@@ -1,4 +1,4 @@
-"""Check a scene or any BaseEnv: ``python -m mappo_unity.scenes.check NAME``; see `core.contract`."""
+"""Check a scene or any BaseEnv: ``python -m mappo_unity.scenes.check NAME``; see `scenes.contract.check`."""
 
 from mappo_unity.scenes.contract.check import main
 
