@@ -36,7 +36,8 @@ def without_code(text: str) -> str:
 def links_of(page: Path) -> list[str]:
     """Return the page's relative links, without their anchors."""
     found = re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text(encoding="utf-8")))
-    return [link.split("#")[0] for link in found if "://" not in link and not link.startswith(("#", "mailto:"))]
+    own = [link for link in found if "://" not in link and not link.startswith(("#", "mailto:"))]
+    return [link.split("#")[0] for link in own]
 
 
 def overlong(text: str) -> list[str]:
