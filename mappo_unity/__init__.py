@@ -6,7 +6,7 @@ other sleep instead of spinning. Where a core is shared, two that spin learn sev
 
 import os
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
