@@ -11,7 +11,8 @@ from mappo_unity.config.schema import Activation, ModelConfig, PPOConfig, Schedu
 from mappo_unity.learning.actor_critic import make_actor, make_critic
 from mappo_unity.learning.distributions import ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
-from mappo_unity.learning.ppo import LEARNS, PolicyLearner
+from mappo_unity.learning.loss import LEARNS
+from mappo_unity.learning.ppo import PolicyLearner
 
 T, G, A, OBS = 12, 5, 2, 3
 TWO_CONTINUOUS = ActionLayout(2, ())

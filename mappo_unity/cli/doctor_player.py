@@ -46,7 +46,9 @@ def examine_player(report: Report, options: argparse.Namespace) -> None:
 def _examine_running(
     report: Report, options: argparse.Namespace, executable: Path | None, log_file: Path
 ) -> None:
-    from mappo_unity.protocol.client import PlayerFailure, PlayerOptions, UnityPlayer
+    from mappo_unity.protocol.client import UnityPlayer
+    from mappo_unity.protocol.player_failures import PlayerFailure
+    from mappo_unity.protocol.player_options import PlayerOptions
 
     settings = PlayerOptions(
         executable,
@@ -71,7 +73,7 @@ def _examine_running(
 
 
 def _cure_of(player: Any, error: Exception) -> str:
-    from mappo_unity.protocol.client import ProtocolMismatch
+    from mappo_unity.protocol.player_failures import ProtocolMismatch
 
     if isinstance(error, ProtocolMismatch):
         return CURES["old package"]

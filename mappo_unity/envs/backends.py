@@ -66,8 +66,9 @@ def _embedded(cfg: EnvConfig) -> MakeEnv:
 
 
 def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
-    from mappo_unity.protocol.client import PlayerOptions, UnityPlayer
+    from mappo_unity.protocol.client import UnityPlayer
     from mappo_unity.protocol.parallel_players import SeveralPlayers
+    from mappo_unity.protocol.player_options import PlayerOptions
     from mappo_unity.protocol.restarting_player import RestartingPlayer
 
     executable = find_player(cfg)

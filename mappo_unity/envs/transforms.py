@@ -11,7 +11,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import CatTensors, Compose, ExcludeTransform, Stack, Transform, TransformedEnv
 
 from mappo_unity import keys
-from mappo_unity.envs.unity_env import UnityEnv, unchecked
+from mappo_unity.envs.tensordicts import unchecked
+from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
 
 

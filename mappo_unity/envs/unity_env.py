@@ -26,6 +26,7 @@ from mappo_unity.envs.opening import first_results, team_sizes
 from mappo_unity.envs.rounds import BehaviorRounds, Episode
 from mappo_unity.envs.slots import SlotTable
 from mappo_unity.envs.specs import make_specs
+from mappo_unity.envs.tensordicts import next_entries, root_entries, slot_shape, unchecked
 from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.contract.rules import (
     MAX_SILENT_STEPS,
@@ -158,7 +159,7 @@ class UnityEnv(EnvBase):
         self._play_until_asked()
         self._note_cut_off()
         self.rounds += 1
-        following = {self.entry_of[name]: self._next(b) for name, b in self._behaviors.items()}
+        following = {self.entry_of[name]: next_entries(b) for name, b in self._behaviors.items()}
         return unchecked(following, self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
@@ -220,7 +221,7 @@ class UnityEnv(EnvBase):
     def _note_cut_off(self) -> None:
         for name, behavior in self._behaviors.items():
             if np.count_nonzero(behavior.cut_off):
-                slots = behavior.cut_off.reshape(self._shape(behavior)).copy()
+                slots = behavior.cut_off.reshape(slot_shape(behavior)).copy()
                 self._cut_off.append(CutOff(self.rounds, name, slots))
 
     def _first_results(self) -> None:
@@ -242,40 +243,6 @@ class UnityEnv(EnvBase):
             self.sides[keys.policy_name(name)].append(name)
         self.entry_of = {n: p if len(sides) == 1 else n for p, sides in self.sides.items() for n in sides}
 
-    # --- TensorDicts
-
-    def _shape(self, behavior: BehaviorRounds) -> torch.Size:
-        return torch.Size((behavior.slots.num_teams, behavior.slots.team_size))
-
-    def _observe(self, behavior: BehaviorRounds, observations: list[np.ndarray]) -> dict[str, torch.Tensor]:
-        shape = self._shape(behavior)
-        out = {
-            keys.SENSOR.format(i): torch.from_numpy(o.reshape(*shape, *o.shape[1:]))
-            for i, o in enumerate(observations)
-        }
-        for key, flags in (
-            (keys.ACTING, behavior.acting),
-            (keys.PRESENT, behavior.present),
-            (keys.DEPARTED, behavior.departed),
-        ):
-            out[key] = torch.from_numpy(flags.reshape(*shape, 1).copy())
-        if behavior.mask.shape[1]:
-            out[keys.MASK] = torch.from_numpy(behavior.mask.reshape(*shape, -1).copy())
-        return out
-
-    def _next(self, behavior: BehaviorRounds) -> TensorDict:
-        shape = self._shape(behavior)
-        out = self._observe(behavior, behavior.end_obs)
-        for key, values in (
-            (keys.REWARD, behavior.reward),
-            (keys.GROUP_REWARD, behavior.group_reward),
-            (keys.TERMINATED, behavior.terminated),
-            (keys.TRUNCATED, behavior.truncated),
-            (keys.DONE, behavior.terminated | behavior.truncated),
-        ):
-            out[key] = torch.from_numpy(values.reshape(*shape, 1))
-        return unchecked(out, shape)
-
     @property
     def round_ended(self) -> bool:
         """Whether an episode ended in the last round."""
@@ -286,19 +253,5 @@ class UnityEnv(EnvBase):
 
     def root(self) -> TensorDict:
         """Return what the agents are asked now: entries as `reset` gives them, ends all False."""
-        out = {}
-        for name, behavior in self._behaviors.items():
-            shape = self._shape(behavior)
-            entries = self._observe(behavior, [o.copy() for o in behavior.obs])
-            for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
-                entries[key] = torch.zeros((*shape, 1), dtype=torch.bool)
-            out[self.entry_of[name]] = unchecked(entries, shape)
-        return unchecked(out, self.batch_size)
-
-
-def unchecked(entries: dict[str, Any], shape: torch.Size, device: torch.device | None = None) -> TensorDict:
-    """Return entries that are known to fit a shape as a TensorDict.
-
-    The checks of TensorDict's constructor take ten times as long as its work, several times a round.
-    """
-    return TensorDict._new_unsafe(entries, shape, device)
+        entries = {self.entry_of[name]: root_entries(b) for name, b in self._behaviors.items()}
+        return unchecked(entries, self.batch_size)

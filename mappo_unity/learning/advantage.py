@@ -1,7 +1,19 @@
 """Pure maths of the learner: the masked advantage recursion, masked statistics, schedules.
 
-In and out: tensors. Knows nothing of TensorDict keys, environments or networks.
-Legend of suffixes: see `keys`; ``_T`` stands for ``[T, ...]`` with any trailing slot dimensions.
+Suffixes: see `keys`; ``_T`` stands for ``[T, ...]`` with any trailing slot dimensions.
+
+The recursion, for slots that do not act in every round: of the k-th row in which a slot has a value (a
+decision was requested of it), with R_k the sum of all rewards that arrived from that row up to the next such
+row or the end,
+
+    delta_k = R_k + gamma * V_next - V_k
+    A_k     = delta_k + gamma * gae_lambda * A_next
+
+where V_next, A_next belong to the next row with a value; at a real end both are 0, at an interruption V_next
+is the value of the terminal observation and A_next is 0. Rounds in which the slot was not asked pass both on
+unchanged. A decision whose outcome has not arrived when the batch ends has no advantage (``known`` is False);
+the rows before it bootstrap from its value. With a value in every round this is GAE (Schulman et al., arXiv
+1506.02438, eq. 16).
 """
 
 from __future__ import annotations
@@ -36,19 +48,7 @@ def masked_gae(
     gamma: float,
     gae_lambda: float,
 ) -> Advantage:
-    """Estimate advantages of slots that do not act in every round.
-
-    For the k-th row of a slot in which it has a value (a decision was asked of it), with R_k the sum
-    of all rewards that arrived from that row up to the next such row or the end,
-
-        delta_k = R_k + gamma * V_next - V_k
-        A_k     = delta_k + gamma * gae_lambda * A_next
-
-    where V_next, A_next belong to the next valued row; at a real end both are 0, at an interruption
-    V_next is the value of the terminal observation and A_next is 0. Rounds in which the slot was not
-    asked pass both on unchanged. A decision whose outcome has not arrived when the batch ends has no
-    advantage (``known`` is False); the rows before it bootstrap from its value. With every slot
-    valued in every round this is GAE (Schulman et al., arXiv 1506.02438, eq. 16).
+    """Estimate advantages of slots that do not act in every round, by the recursion above.
 
     Args:
         reward_T: float ``[T, ...]``, reward that arrived in a round.
@@ -56,32 +56,60 @@ def masked_gae(
         end_value_T: float ``[T, ...]``, value of the terminal observation (read where truncated).
         final_value, final_valued: ``[...]``, value and mask of the row after the last.
         valued_T, terminated_T, truncated_T: bool ``[T, ...]``.
-
-    Returns:
-        `Advantage`.
     """
+    ended_T = terminated_T | truncated_T
+    end_value_T = torch.where(truncated_T, end_value_T, 0.0)  # of a real end it is 0
+
+    advantage_T, known_T = _walk_back(
+        *(reward_T, value_T, end_value_T, final_value, valued_T, final_valued, ended_T),
+        gamma=gamma,
+        gae_lambda=gae_lambda,
+    )
+    target_T = torch.where(known_T, advantage_T + value_T, 0.0)
+    return Advantage(advantage_T, target_T, known_T)
+
+
+def _walk_back(
+    reward_T: Tensor,
+    value_T: Tensor,
+    end_value_T: Tensor,
+    final_value: Tensor,
+    valued_T: Tensor,
+    final_valued: Tensor,
+    ended_T: Tensor,
+    *,
+    gamma: float,
+    gae_lambda: float,
+) -> tuple[Tensor, Tensor]:
+    """Return the advantages, and which of them are known, from the last row to the first."""
     advantage_T = torch.zeros_like(value_T)
     known_T = torch.zeros_like(valued_T)
+
+    # what the rows after t hand back to row t; `waiting` is the reward since the last row with a value
     zero = torch.zeros_like(final_value)
     next_value, next_advantage, waiting = final_value, zero, zero
     known = final_valued.clone()
-    ended_T = terminated_T | truncated_T
-    boot_T = torch.where(truncated_T, end_value_T, 0.0)
+
     for t in range(len(reward_T) - 1, -1, -1):
         ended, valued = ended_T[t], valued_T[t]
+
+        # an end lets nothing of the next episode through
         waiting = reward_T[t] + torch.where(ended, zero, waiting)
-        next_value = torch.where(ended, boot_T[t], next_value)
+        next_value = torch.where(ended, end_value_T[t], next_value)
         next_advantage = torch.where(ended, zero, next_advantage)
         known = known | ended
+
         row = waiting + gamma * next_value - value_T[t] + gamma * gae_lambda * next_advantage
         known_T[t] = valued & known
         advantage_T[t] = torch.where(known_T[t], row, zero)
+
+        # rounds without a value pass on what they got
         next_advantage = torch.where(valued, advantage_T[t], next_advantage)
         next_value = torch.where(valued, value_T[t], next_value)
         waiting = torch.where(valued, zero, waiting)
         known = known | valued
-    target_T = torch.where(known_T, advantage_T + value_T, 0.0)
-    return Advantage(advantage_T, target_T, known_T)
+
+    return advantage_T, known_T
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:

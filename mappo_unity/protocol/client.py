@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from mlagents_envs import __version__ as MLAGENTS_VERSION
@@ -23,50 +21,22 @@ from mlagents_envs.side_channel.engine_configuration_channel import EngineConfig
 from mlagents_envs.side_channel.environment_parameters_channel import EnvironmentParametersChannel
 from mlagents_envs.side_channel.side_channel_manager import SideChannelManager
 
-from mappo_unity.errors import ConfigError
 from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.decode import ActionEncoder, BehaviorDecoder, MalformedMessage, behavior_spec
 from mappo_unity.protocol.messages import STATUS_OK
+from mappo_unity.protocol.player_failures import (
+    PlayerFailure,
+    ProtocolMismatch,
+    never_answered,
+    never_connected,
+)
+from mappo_unity.protocol.player_options import PlayerOptions
 from mappo_unity.protocol.process import PlayerProcess
 from mappo_unity.protocol.server import Link, LinkTimeout
 
-NOBODY_ASKS = (
-    "every Agent needs a DecisionRequester (or a call of RequestDecision), Behavior Type Default, and an "
-    "active object"
-)
 CLOSE_S = 5.0  # how long a player may take to leave before it is killed
 
 logger = logging.getLogger(__name__)
-
-
-class PlayerFailure(RuntimeError):
-    """A player crashed, hung, left or sent nonsense; the message says what it logged or printed."""
-
-
-class ProtocolMismatch(PlayerFailure, ConfigError):
-    """The player speaks another version of the protocol."""
-
-
-@dataclass
-class PlayerOptions:
-    """How to start a player; `executable` None waits for the Unity Editor on `port`."""
-
-    executable: Path | None
-    log_file: Path
-    port: int = 0
-    timeout_s: float = 60.0
-    arguments: list[str] = field(default_factory=list)
-    no_graphics: bool = False
-    num_areas: int = 1
-    parameters: dict[str, float] = field(default_factory=dict)
-    engine: dict[str, Any] = field(default_factory=dict)
-    """Arguments of EngineConfigurationChannel.set_configuration_parameters."""
-
-    @property
-    def own_log_file(self) -> Path | None:
-        """The log that `arguments` choose in place of `log_file`."""
-        pairs = zip(self.arguments, self.arguments[1:])
-        return next((Path(path) for name, path in pairs if name.lower() == "-logfile"), None)
 
 
 class UnityPlayer(BaseEnv):
@@ -105,7 +75,9 @@ class UnityPlayer(BaseEnv):
         if options.executable is not None:
             try:
                 output = options.log_file.with_suffix(".out")
-                self.process = PlayerProcess(options.executable, self._arguments(), output)
+                self.process = PlayerProcess(
+                    options.executable, options.command_line(self._link.port), output
+                )
             except BaseException:
                 self._link.close()
                 raise
@@ -127,15 +99,7 @@ class UnityPlayer(BaseEnv):
             )
         output = self._receive()
         self.handshake = output.rl_initialization_output
-        version = self.handshake.communication_version
-        if version.split(".")[0] != messages.API_VERSION.split(".")[0]:
-            error = ProtocolMismatch(
-                f"{self._name()} speaks version {version!r} of the ML-Agents protocol (package "
-                f"{self.handshake.package_version or 'unknown'}), this trainer {messages.API_VERSION}; the "
-                f"first numbers must agree: build it with com.unity.ml-agents 2.0 or later{self._log_hint()}"
-            )
-            self.close()
-            raise error
+        self._check_version()
         self._reply(decode.initialization(self.seed, self.options.num_areas, MLAGENTS_VERSION))
         self._receive()  # the player's empty message: it waits for the first command
 
@@ -225,14 +189,6 @@ class UnityPlayer(BaseEnv):
 
     # ---- below --------------------------------------------------------------------------------------------
 
-    def _arguments(self) -> list[str]:
-        options = self.options
-        arguments = ["-nographics", "-batchmode"] if options.no_graphics else []
-        arguments += ["--mlagents-port", str(self._link.port)]
-        if options.own_log_file is None:
-            arguments += ["-logFile", str(options.log_file)]
-        return arguments + options.arguments
-
     def _send(self, actions: dict[str, bytes], command: int) -> None:
         if not self._open:
             raise UnityEnvironmentException(f"{self._name()} is closed")
@@ -255,8 +211,23 @@ class UnityPlayer(BaseEnv):
         except DecodeError as error:
             raise self._failure(f"sent a malformed message of {len(data)} bytes ({error})") from error
         if answer.header.status != STATUS_OK:
-            raise self._failure(f"closed the connection{_quoted(answer.header.message)}")
+            reason = answer.header.message
+            raise self._failure("closed the connection" + (f": {reason}" if reason else ""))
         return answer.unity_output
+
+    def _check_version(self) -> None:
+        version = self.handshake.communication_version
+        if version.split(".")[0] == messages.API_VERSION.split(".")[0]:
+            return
+
+        # the message first: it quotes the player's log, which is read while the player still stands
+        error = ProtocolMismatch(
+            f"{self._name()} speaks version {version!r} of the ML-Agents protocol (package "
+            f"{self.handshake.package_version or 'unknown'}), this trainer {messages.API_VERSION}; the "
+            f"first numbers must agree: build it with com.unity.ml-agents 2.0 or later{self._log_hint()}"
+        )
+        self.close()
+        raise error
 
     def _check_alive(self) -> None:
         how = self.process.ended() if self.process is not None else None
@@ -265,19 +236,9 @@ class UnityPlayer(BaseEnv):
             raise self._failure(f"ended {when}: {how}")
 
     def _silence(self) -> str:
-        limit = f"within env.timeout_s={self.options.timeout_s:g}"
-        if self.handshake is not None:
-            hint = "" if self._decoders else f": no agent asks for a decision; {NOBODY_ASKS}"
-            return f"did not answer {limit}{hint}"
-        if self.process is None:
-            return (
-                f"did not connect to port {self._link.port} {limit}: press Play in a scene whose agents have "
-                "Behavior Type Default, and see that no other training is on that port"
-            )
-        return (
-            f"did not connect {limit}: it may need env.no_graphics=true on a machine without a display, wait "
-            "for a user, or hold no agent with Behavior Type Default"
-        )
+        if self.handshake is None:
+            return never_connected(self.options, self._link.port)
+        return never_answered(self.options.timeout_s, bool(self._decoders))
 
     def _add_behaviors(self, output: Any) -> None:
         for brain in output.rl_initialization_output.brain_parameters:
@@ -321,7 +282,3 @@ class UnityPlayer(BaseEnv):
 
 
 MakePlayer = Callable[[int], UnityPlayer]
-
-
-def _quoted(text: str) -> str:
-    return f": {text}" if text else ""

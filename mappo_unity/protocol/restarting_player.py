@@ -15,7 +15,8 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 
 from mappo_unity.errors import ConfigError, EnvironmentFailure
-from mappo_unity.protocol.client import MakePlayer, PlayerFailure, UnityPlayer
+from mappo_unity.protocol.client import MakePlayer, UnityPlayer
+from mappo_unity.protocol.player_failures import PlayerFailure
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 """Pause before the second try in a row (before the first there is none), doubled with every further one."""
