@@ -24,10 +24,12 @@ class ActionCheck:
         """Raise `UnityActionException` if `action` does not suit the agents, one row each."""
         behavior = self._behavior
         self._spec._validate_action(action, len(agent_ids), behavior.name)
+
         if behavior.continuous:
             finite = np.isfinite(action.continuous)
             if np.count_nonzero(finite) < finite.size:
                 self._refuse(action, agent_ids, ~finite)
+
         if behavior.branches:
             outside = action.discrete.view(np.uint32) >= self._sizes  # negative ones are large here
             if np.count_nonzero(outside):

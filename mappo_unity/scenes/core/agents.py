@@ -50,13 +50,18 @@ class Agents:
         self.behavior = behavior.astype(np.int64)
         self.done = np.zeros(num_slots, bool)
         self.step_count = np.zeros(num_slots, np.int64)
+
+        # What the next record and the next tick take.
         self.reward = np.zeros(num_slots, np.float32)
         self.group_reward = np.zeros(num_slots, np.float32)
         self.continuous = np.zeros((num_slots, num_continuous), np.float32)
         self.discrete = np.zeros((num_slots, num_branches), np.int32)
+
         self.next_id = num_slots
         self._num_behaviors = num_behaviors
         self._one_tick = np.ones(num_slots, np.int64)  # numpy adds arrays of one shape fastest
+
+        # Looked up at every tick, made anew only after somebody comes, goes or moves.
         self._order: np.ndarray | None = None
         self._is_slot_order = False
         self._members: list[np.ndarray] | None = None

@@ -58,6 +58,8 @@ def spheres(view: View, offset: np.ndarray, radius: float, tag: np.ndarray) -> P
     disc = np.sqrt(np.maximum(radius * radius - height * height, 0.0))
     row, column, (h, w), (right, ahead) = _in_sight(view, offset, disc + CELL_HALF, disc > 0)
     disc = disc[row, column]
+
+    # A disc touches a cell if the cell's nearest point is within it.
     dx, dz = (np.maximum(np.abs(side) - CELL_HALF, 0.0) for side in (right, ahead))
     inside = (dx * dx)[:, :, None] + (dz * dz)[:, None, :] <= (disc * disc)[:, None, None]
     inside &= _in_grid(h, w)
@@ -79,11 +81,15 @@ def upright_boxes(
     sin, cos = np.sin(turn), np.cos(turn)
     spread = np.abs(sin) + np.abs(cos)  # half-width of a turned square of half-edge 1
     right, ahead = right[:, :, None], ahead[:, None, :]
+
+    # Separating axes of two squares: the cell's two, then the cube's two.
     inside = np.maximum(np.abs(right), np.abs(ahead)) <= CELL_HALF + half * spread
     inside &= np.abs(right * cos - ahead * sin) <= half + CELL_HALF * spread
     inside &= np.abs(right * sin + ahead * cos) <= half + CELL_HALF * spread
     inside &= _in_grid(h, w)
     x, y, z = offset[:, row, column]
+
+    # The bounding box lies along the world's axes: by it the nearest of two shapes is found.
     world = np.arctan2(view.sin, view.cos)[row] + turn[:, 0, 0]
     half = half[:, 0, 0]
     reach = half * (np.abs(np.sin(world)) + np.abs(np.cos(world)))
@@ -104,21 +110,27 @@ def square_lines(view: View, lines: tuple[float, ...], tag: int, seen: np.ndarra
     right = (MIDDLE - np.arange(CELLS)) * scale  # of h
     ahead = -right  # of w: (w - 19.5) * scale
     spread = np.abs(sin) + np.abs(cos)
+
+    # How far the middles of all cells are from the origin along the world's axes.
     world_x, world_z = right * cos, -right * sin
     world_x += x
     world_z += z
     world_x = np.abs(world_x[:, :, None] + (ahead * sin)[:, None, :])
     world_z = np.abs(world_z[:, :, None] + (ahead * cos)[:, None, :])
     reach = np.maximum(world_x, world_z, out=world_x)
+
+    # The world's two axes, then the cells' own two.
     on_right = np.abs(right + (x * cos - z * sin))
     on_ahead = np.abs(ahead + (x * sin + z * cos))
     extent = (CELL_HALF * spread)[:, :, None]
+
     inside = np.zeros(reach.shape, bool)
     for line in lines:
         touches = (reach >= line - extent) & (reach <= line + extent)
         touches &= (on_right <= line * spread + CELL_HALF)[:, :, None]
         touches &= (on_ahead <= line * spread + CELL_HALF)[:, None, :]
         inside |= touches
+
     x, z = x[:, 0], z[:, 0]
     outer = lines[-1]
     box = np.stack([-outer - x, outer - x, -outer - z, outer - z, np.zeros(rows.size)])
@@ -131,6 +143,8 @@ def one_hot(view: View, num_tags: int, parts: list[Painted]) -> np.ndarray:
     boxes = np.cumsum([0] + [part.box.shape[1] for part in parts])
     row, cell, tag = (np.concatenate([part[i] for part in parts]) for i in range(3))
     shape = np.concatenate([part.shape + start for part, start in zip(parts, boxes[:-1], strict=True)])
+
+    # Nearly every cell has one shape: whoever wrote last owns it, and only disputed cells are compared.
     key = row * CELLS**2 + cell
     number = np.arange(key.size)
     owner = np.empty(len(view.x) * CELLS**2, np.int64)  # read only where it is written
@@ -143,6 +157,7 @@ def one_hot(view: View, num_tags: int, parts: list[Painted]) -> np.ndarray:
         order = rivals[np.argsort(-_distance(view, row[rivals], cell[rivals], box), kind="stable")]
         owner[key[order]] = order  # the last one written stays: the nearest
         wins = owner[key] == number
+
     grid = np.zeros((len(view.x), num_tags, CELLS, CELLS), np.float32)
     grid.reshape(-1)[(row[wins] * num_tags + tag[wins]) * CELLS**2 + cell[wins]] = 1.0
     return grid
@@ -164,10 +179,12 @@ def _in_sight(
     seen = seen & (np.abs(right) <= limit) & (np.abs(ahead) <= limit)
     row, column = np.nonzero(seen)
     right, ahead, reach, step = right[seen], ahead[seen], reach[seen], view.scale[row]
+
     count = int((2 * reach / step).max(initial=0.0)) + 1
     first_h = np.ceil(MIDDLE - (right + reach) / step)
     first_w = np.ceil(MIDDLE + (ahead - reach) / step)
     h, w = first_h[:, None] + np.arange(count), first_w[:, None] + np.arange(count)
+
     step, right, ahead = step[:, None], right[:, None], ahead[:, None]
     ways = (MIDDLE - h) * step - right, (w - MIDDLE) * step - ahead
     return row, column, (h.astype(np.int64), w.astype(np.int64)), ways

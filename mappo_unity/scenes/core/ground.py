@@ -152,10 +152,13 @@ def stop_pair(
     mobility = inverse_mass + other_inverse_mass
     speed = np.einsum("ni,ni->n", approach, normal)
     lack = np.maximum(-speed - np.maximum(gap, 0.0) / TICK_S, 0.0)
+
     impulse = lack / np.maximum((normal * normal * mobility).sum(axis=-1), 1e-12)
     push = normal * impulse[:, None]
     velocity += push * inverse_mass
     other_velocity -= push * other_inverse_mass
+
+    # Friction stops the slip, but by no more than its share of the normal impulse.
     if friction:
         rub = approach - normal * speed[:, None]
         slip = np.sqrt(np.einsum("ni,ni->n", rub, rub))
@@ -185,9 +188,12 @@ def _projections(
     sin, cos = np.sin(turn), np.cos(turn)
     along, reach = np.empty((5, len(offset))), np.empty((5, len(offset)))
     x, y, z = along[:3] = offset.T if other_yaw is None else _turned(offset.T, -other_yaw)
+
+    # The first three are the other's axes, the last two the body's own across and ahead.
     along[3] = x * cos - z * sin
     along[4] = x * sin + z * cos
     abs_sin, abs_cos = np.abs(sin), np.abs(cos)
+
     reach[0] = other[0] + half[0] * abs_cos + half[2] * abs_sin
     reach[1] = other[1] + half[1]
     reach[2] = other[2] + half[0] * abs_sin + half[2] * abs_cos

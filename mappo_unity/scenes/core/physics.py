@@ -43,14 +43,18 @@ class AreaPhysics:
         self, area: mujoco.MjSpec, num_areas: int, *, num_threads: int = 1, areas_per_model: int = 1
     ) -> None:
         area = area.copy()
+
+        # Nothing may be carried over that a snapshot lacks, and a state that is not finite must be seen.
         area.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
         area.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.model: mujoco.MjModel = area.compile()
+
         num_models = -(-num_areas // areas_per_model)
         self._per_model = -(-num_areas // num_models)  # evenly; the last model may hold idle areas
         shared = self.model if self._per_model == 1 else _repeated(area, self.model, self._per_model)
         self._models = [shared] * num_models
         self._shared = shared
+
         self._data = [mujoco.MjData(shared) for _ in range(num_threads)]
         self._scratch = mujoco.MjData(shared)
         self._rollout = Rollout(nthread=num_threads if num_threads > 1 else 0)
@@ -67,12 +71,15 @@ class AreaPhysics:
         rows: slice | np.ndarray = slice(None) if areas is None else areas
         models = self._models if areas is None else [self._models[area] for area in areas.tolist()]
         num_models, per_area = len(models), (len(models) * self._per_model, -1)
+
+        # Positions, velocities and inputs into MuJoCo's own rows.
         state = self._state[rows]  # of all areas: a view, to be changed in place; of some: a copy
         state[:, 1 : 1 + self._nq] = self._qpos[rows].reshape(num_models, -1)
         state[:, 1 + self._nq : 1 + self._nq + self._nv] = self._qvel[rows].reshape(num_models, -1)
         control, out, sensors = (buffer[:num_models] for buffer in self._buffers(num_substeps))
         for columns, values in self._inputs:
             control[:, :, columns] = values[rows].reshape(num_models, 1, -1)
+
         self._rollout.rollout(
             models,
             self._data,
@@ -84,6 +91,7 @@ class AreaPhysics:
             state=out,
             sensordata=sensors,
         )
+
         last = out[:, -1]
         self._state[rows, 1:] = last[:, 1:]  # the clock stays 0: nothing may depend on it
         self._qpos[rows] = last[:, 1 : 1 + self._nq].reshape(per_area)
@@ -91,6 +99,7 @@ class AreaPhysics:
         if sensors.shape[2]:
             self._sensordata[rows] = sensors[:, -1].reshape(per_area)
             self._last_sensors = sensors
+
         if not np.isfinite(self._qvel[rows].sum()):
             area = int(np.flatnonzero(~np.isfinite(self._qvel).all(axis=1))[0])
             raise FloatingPointError(f"physics of area {area} is not finite any more")
@@ -145,6 +154,7 @@ class AreaPhysics:
         self._qvel = np.zeros((count, model.nv))
         self._sensordata = np.zeros((count, model.nsensordata))
         self._state = np.zeros((len(self._models), mujoco.mj_stateSize(self._shared, _STATE)))
+
         mocap = model.body_mocapid >= 0
         order = np.argsort(model.body_mocapid[mocap])
         self._input_arrays = {
@@ -153,12 +163,16 @@ class AreaPhysics:
             "mocap_pos": np.tile(model.body_pos[mocap][order], (count, 1, 1)),
             "mocap_quat": np.tile(model.body_quat[mocap][order], (count, 1, 1)),
         }
+
+        # What scenes see: views without the idle areas.
         self.qpos, self.qvel = self._qpos[: self._num_areas], self._qvel[: self._num_areas]
         self.sensordata = self._sensordata[: self._num_areas]
         self.ctrl = self._input_arrays["ctrl"][: self._num_areas]
         self.qfrc_applied = self._input_arrays["qfrc_applied"][: self._num_areas]
         self.mocap_pos = self._input_arrays["mocap_pos"][: self._num_areas]
         self.mocap_quat = self._input_arrays["mocap_quat"][: self._num_areas]
+
+        # Only inputs that the model has are handed over, side by side in one row.
         self._inputs: list[tuple[slice, np.ndarray]] = []
         self._control_spec, start = 0, 0
         for name, bit in _INPUTS:
@@ -167,6 +181,7 @@ class AreaPhysics:
                 self._control_spec |= int(bit)
                 self._inputs.append((slice(start, start + size), self._input_arrays[name]))
                 start += size
+
         self._last_sensors = np.zeros((len(self._models), 1, self._shared.nsensordata))
         self._by_substeps: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 

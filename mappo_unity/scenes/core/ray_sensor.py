@@ -93,11 +93,13 @@ class RaySensor:
         """
         count, rays, colliders = distance.shape
         frame = np.zeros((count, rays, self.tags + 2), np.float32)
+
         nearest = distance.argmin(axis=2)
         travelled = np.take_along_axis(distance, nearest[..., None], 2)[..., 0] / self.cast_length
         hit = travelled <= 1.0
         frame[..., -1] = np.where(hit, travelled, 1.0)
         frame[..., -2] = ~hit
+
         tag = np.broadcast_to(tags, (count, colliders))[np.arange(count)[:, None], nearest]
         listed = hit & (tag >= 0)
         agent, ray = np.nonzero(listed)

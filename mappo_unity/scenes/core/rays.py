@@ -56,15 +56,20 @@ def cast_capsules(
     total = reach + radius
     offset = origin - low
     along, slope = _dot(offset, unit), _dot(direction, unit)
+
+    # The capsule's side: an endless cylinder, of which only the piece between the ends counts.
     side, lateral = offset - along[..., None] * unit, direction - slope[..., None] * unit
     a = np.maximum(_dot(lateral, lateral), _TINY)
     body = _entry(_dot(side, lateral) / a, (_dot(side, side) - np.square(total)) / a, False)
     with np.errstate(invalid="ignore"):
         place = along + body * slope
     body = np.where((place >= 0) & (place <= length), body, np.inf)
+
     caps = np.minimum(
         cast_spheres(origin, direction, low, total), cast_spheres(origin, direction, high, total)
     )
+
+    # PhysX leaves out what a sphere touches where it starts.
     near = side + (along - np.clip(along, 0, length))[..., None] * unit
     touching = _dot(near, near) < np.square(total + skip_gap)
     return np.where(touching, np.inf, np.minimum(body, caps))
@@ -87,6 +92,8 @@ def cast_rectangles(
     local, turned = _to_box(origin - centre, yaw), _to_box(direction, yaw)
     travel, within = _enter_slabs(local, turned, half, radius)
     touching = _beyond(local, half) < np.square(radius + skip_gap)
+
+    # The enlarged rectangle has round corners: who enters beyond both edges is cast against a circle.
     corner = np.isfinite(travel) & (within == 0)
     if corner.any():
         start, ahead, extent = _pick((local, turned, half), corner)
@@ -188,6 +195,7 @@ def _enter_slabs(
         middle, width = -o * inverse, np.abs(inverse) * (h + radius)
         enter = np.maximum(enter, middle - width)
         leave = np.minimum(leave, middle + width)
+
     within = sum((np.abs(o + enter * d) <= h).astype(np.int8) for o, d, h in axes)
     return np.where(enter <= leave, enter, np.inf), np.asarray(within)
 

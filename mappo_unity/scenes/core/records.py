@@ -54,6 +54,7 @@ class Records:
             agents.group_id[slots],
             agents.group_reward[slots],
         )
+
         agents.reward[slots] = 0
         agents.group_reward[slots] = 0
         agents.done[slots] = False
@@ -70,6 +71,7 @@ class Records:
             agents.group_id[slots],
             agents.group_reward[slots],
         )
+
         self._queue.add(behavior, steps)
         self._stacks.clear(slots)
         agents.finish(slots)
@@ -140,6 +142,7 @@ def steps_state(steps: Steps) -> dict[str, Any]:
         "group_id": steps.group_id.copy(),
         "group_reward": steps.group_reward.copy(),
     }
+
     if isinstance(steps, TerminalSteps):
         state["interrupted"] = steps.interrupted.copy()
     else:

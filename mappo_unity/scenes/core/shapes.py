@@ -196,11 +196,13 @@ def agent_cube(
     """Return an agent as Unity draws it: a cube with two eyes; `yaw` in rad."""
     middle, turn = np.asarray(middle, float), yaw_rotation(yaw)
     shapes = [box(middle, (half, half, half), color, turn)]
+
     for side in (-1, 1):
         eye = middle + turn @ (half * np.array([0.42 * side, 0.35, 0.98]))
         pupil = middle + turn @ (half * np.array([0.42 * side, 0.35, 1.10]))
         shapes += [ball(eye, 0.26 * half, WHITE, shadow=False)]
         shapes += [ball(pupil, 0.16 * half, DARK, shadow=False)]
+
     if headband:
         band = middle + turn @ (half * np.array([0.0, 0.78, 0.0]))
         shapes.append(box(band, (1.03 * half, 0.12 * half, 1.03 * half), WHITE, turn, shadow=False))

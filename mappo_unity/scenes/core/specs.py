@@ -85,8 +85,10 @@ def checked_parameter(scene: str, known: Mapping[str, Parameter], name: str, val
             f"scene {scene} has no parameter {name!r}; choices: {', '.join(sorted(known)) or 'none'} "
             f"(besides num_areas and num_threads)"
         )
+
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(float(value)):
         raise ConfigError(f"parameter {name}={value!r} of scene {scene} must be a finite number")
+
     number = float(value)
     if number <= known[name].above:
         raise ConfigError(
