@@ -3,7 +3,7 @@
 
     scripts/draw_scenes.py [SCENE ...] [--out docs/scenes]
 
-Random actions for a few decisions from a fixed seed; needs Pillow and an offscreen OpenGL (README, Films).
+Random actions for a few decisions from a fixed seed; needs Pillow and an offscreen OpenGL (README, Videos).
 """
 
 from __future__ import annotations
