@@ -13,7 +13,7 @@ from mappo_unity.errors import ConfigError
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 TINY = [
-    *("env=3DBall", "env.num_areas=4", "collect.rounds=16", "model.hidden=[8]", "log.backends=[]"),
+    *("env=3DBall", "env.num_areas=4", "collect.rounds=16", "model.hidden=[8]", "log.loggers=[]"),
     *("hydra.run.dir=run", "export_onnx=false"),
 ]
 

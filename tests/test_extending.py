@@ -27,7 +27,7 @@ from mappo_unity.training.trainer import train
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 TINY = [
     *("env=custom", "env.name=Mine", "collect.rounds=8", "model.hidden=[8]", "max_steps=64"),
-    *("ppo.epochs=1", "ppo.num_minibatches=2", "log.backends=[]", "log.progress=false"),
+    *("ppo.epochs=1", "ppo.num_minibatches=2", "log.loggers=[]", "log.progress=false"),
     *("export_onnx=false",),
 ]
 

@@ -25,7 +25,7 @@ MODULES = ("target_scene", "other_scene")
 TRAIN = [
     *("env=custom", "env.backend=embedded", "env.name=Target", "env.num_areas=4", "env.params.radius=0.5"),
     *("collect.rounds=8", "model.hidden=[8]", "ppo.epochs=1", "ppo.num_minibatches=2"),
-    *("log.backends=[]", "log.progress=false", "export_onnx=false", "max_steps=64"),
+    *("log.loggers=[]", "log.progress=false", "export_onnx=false", "max_steps=64"),
 ]
 
 Install = Callable[..., None]
