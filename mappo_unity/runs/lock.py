@@ -1,7 +1,7 @@
 """One training at a time in a run folder.
 
 In: a run folder. Out: a lock that the operating system holds for this process, and takes back however the
-process ends: none is ever left over. Those who only read a run (evaluation, export, films) take none.
+process ends: none is ever left over. Those who only read a run (evaluation, export, videos) take none.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _take(folder: Path, file: BinaryIO) -> str | None:
     except BlockingIOError as error:
         raise ConfigError(
             f"the run in {folder} is being trained by another process{_holder(file)}: wait for its end or "
-            "end it, then continue the run; mappo-eval, mappo-export and mappo-play can read it meanwhile"
+            "end it, then resume the run; mappo-eval, mappo-export and mappo-play can read it meanwhile"
         ) from error
     except OSError as error:
         return _no_lock(folder, error)
