@@ -89,8 +89,8 @@ def run(arguments: argparse.Namespace, variant: str, seed: int) -> str:
 def play(cfg: Config, setup: TrainingSetup, count: int) -> str:
     """Play matches of the trained policy against a random side."""
     actors = {name: learner.actor for name, learner in setup.learners.items()}
-    player = ActorPolicy(describe_policies(setup.env), actors, False, "the policy")
-    scores = play_matches(make_env_function(cfg.env), player, RandomPolicy(1), count, seed=1)
+    policy = ActorPolicy(describe_policies(setup.env), actors, False, "the policy")
+    scores = play_matches(make_env_function(cfg.env), policy, RandomPolicy(1), count, seed=1)
     figures = match_figures(scores)
     return "; ".join(
         f"{name}: {side['wins']} won {side['losses']} lost {side['draws']} drawn"

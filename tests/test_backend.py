@@ -202,13 +202,16 @@ class TestFailures:
             steps = 0
             while not env.restarts:
                 before = env.get_steps(BALL)[0]
-                assert not env.cut_off
+                assert not env.crashed_agents
                 act_and_step(env)
                 steps += 1
                 assert steps < 30
         decision, terminal = env.get_steps(BALL)
         assert (
-            env.cut_off[BALL].tolist() == [0, 1] == terminal.agent_id.tolist() == decision.agent_id.tolist()
+            env.crashed_agents[BALL].tolist()
+            == [0, 1]
+            == terminal.agent_id.tolist()
+            == decision.agent_id.tolist()
         )
         assert terminal.interrupted.all() and not terminal.reward.any()
         np.testing.assert_array_equal(terminal.obs[0], before.obs[0])
@@ -219,7 +222,7 @@ class TestFailures:
         assert re.search(words, caplog.text) and "restart 1 of at most 1" in caplog.text
         assert str(tmp_path / "logs" / "Player-0.log") in caplog.text
         act_and_step(env)
-        assert not env.cut_off and not len(env.get_steps(BALL)[1])
+        assert not env.crashed_agents and not len(env.get_steps(BALL)[1])
         with pytest.raises(
             EnvironmentFailure, match="restarted 1 times, and env.max_restarts=1 allows no more"
         ):
@@ -380,7 +383,7 @@ class TestSeveral:
         os.kill(victim.pid, signal.SIGKILL)
         act_and_step(env)
         decision, terminal = env.get_steps(BALL)
-        assert env.restarts == 1 and env.cut_off[BALL].tolist() == [1, 3] == terminal.agent_id.tolist()
+        assert env.restarts == 1 and env.crashed_agents[BALL].tolist() == [1, 3] == terminal.agent_id.tolist()
         assert sorted(decision.agent_id.tolist()) == [0, 1, 2, 3]
         env.close()
 

@@ -14,7 +14,7 @@ from mappo_unity.config import compose, presets
 from mappo_unity.config.compose import check_effect, compose_config, compose_plain, load_config
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.option_table import option_table
-from mappo_unity.config.overrides import given, shell_argument
+from mappo_unity.config.overrides import last_value, shell_argument
 from mappo_unity.config.per_behavior import behavior_config
 from mappo_unity.config.presets import conf_dir
 from mappo_unity.config.schema import Activation, Config, EvalConfig, LoggerKind
@@ -347,7 +347,7 @@ def test_an_argument_for_the_shell_names_the_same_path(path: str, argument: str 
     shown = shell_argument("resume", path)
     assert argument in (None, shown)
     (line,) = shlex.split(shown)
-    assert given([line], "resume") == path
+    assert last_value([line], "resume") == path
 
 
 def test_evaluation_options() -> None:

@@ -35,7 +35,7 @@ class Fragile(ScriptedEnv):
         return int(self.at >= self.breaks_at)
 
     @property
-    def cut_off(self) -> dict[str, np.ndarray]:
+    def crashed_agents(self) -> dict[str, np.ndarray]:
         return {FAKE: np.array(self.cut, np.int32)} if self.at == self.breaks_at else {}
 
 
@@ -69,9 +69,9 @@ def test_a_cut_episode_neither_counts_nor_is_learned_from() -> None:
     ]
     env = fragile(script, 3, (0, 1))
     batch = idle(env, 5)
-    cuts = env.pop_cut_off()
+    cuts = env.pop_crashed_episodes()
     assert [(c.round, c.behavior, c.slots.ravel().tolist()) for c in cuts] == [(2, FAKE, [True, True])]
-    assert not env.pop_cut_off()
+    assert not env.pop_crashed_episodes()
     assert env.restarts == 1
     finished = env.pop_episodes()[FAKE]
     assert [(e.individual_return, e.length) for e in finished] == [(5, 1), (5, 2)]
@@ -123,7 +123,7 @@ def test_drops_reach_batches_of_the_collector() -> None:
     base.breaks_at, base.cut = 8, (1,)
     base.script[8] = [Record(1, ends="interrupted"), Record(0), Record(1)]
     batch = next(batches)
-    dropped = mask_crashed_episodes(batch, env.pop_cut_off(), env)
+    dropped = mask_crashed_episodes(batch, env.pop_crashed_episodes(), env)
     assert dropped == 3  # results 5, 6 and 7 are rows 0 to 2 of the second batch
     assert batch["Fake", "acting"].reshape(5, 2).T.tolist() == [[True] * 5, [False] * 3 + [True] * 2]
     collector.shutdown()
@@ -144,7 +144,7 @@ def failing_factory(seed: int, steps: int) -> Any:
         step()
 
     scene.step = counted
-    scene.restarts, scene.cut_off = 0, {}
+    scene.restarts, scene.crashed_agents = 0, {}
     return scene
 
 

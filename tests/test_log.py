@@ -169,7 +169,7 @@ def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
             log.log(row(2))
         (tmp_path / "checkpoints").mkdir()
         (tmp_path / "checkpoints" / "step_000000000001.pt").touch()
-        with pytest.raises(ConfigError, match=r"No space left on device.*continue with resume="):
+        with pytest.raises(ConfigError, match=r"No space left on device.*resume with resume="):
             log.log(row(2))
 
 

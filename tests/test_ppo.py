@@ -11,7 +11,7 @@ from mappo_unity.config.schema import Activation, ModelConfig, PPOConfig, Schedu
 from mappo_unity.learning.actor_critic import make_actor, make_critic
 from mappo_unity.learning.distributions import ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
-from mappo_unity.learning.loss import LEARNS
+from mappo_unity.learning.loss import ACTOR_LEARNS
 from mappo_unity.learning.ppo import PolicyLearner
 
 T, G, A, OBS = 12, 5, 2, 3
@@ -84,7 +84,7 @@ def test_rows_in_which_nobody_acted_carry_no_loss():
     # five rounds of decisions with their outcomes; of the sixth only what ended in the last round
     ended_last = batch["next", "terminated"][-1]
     assert len(rows) == (T // 2 - 1) * G + int(ended_last.any(1).sum())
-    assert int(rows[LEARNS].sum()) == (T // 2 - 1) * G * A + int(ended_last.sum())
+    assert int(rows[ACTOR_LEARNS].sum()) == (T // 2 - 1) * G * A + int(ended_last.sum())
     # garbage in rows without a decision changes nothing
     other = batch.clone()
     quiet = ~acting.expand_as(batch["observation"])
@@ -185,8 +185,8 @@ def test_departed_members_train_the_critic_and_not_the_policy():
     batch = make_batch(learner, acting)
     batch["departed"] = batch["next", "departed"] = ~acting
     rows, _ = learner._prepare(batch)
-    assert rows["learns"][:, 1].sum() == 0
-    assert rows["valued"][:, 1].sum() == rows["valued"][:, 0].sum() > 0
+    assert rows["actor_learns"][:, 1].sum() == 0
+    assert rows["critic_learns"][:, 1].sum() == rows["valued"][:, 0].sum() > 0
     one, two = copy.deepcopy(learner), copy.deepcopy(learner)
     other = rows.clone()
     other["value_target"][:, 1] += 5.0

@@ -14,9 +14,9 @@ import pytest
 import yaml
 
 from mappo_unity.cli import eval_main, export_main, play_main, train_main
-from mappo_unity.config.behavior_lines import dotted_options, readable_line, readable_lines
+from mappo_unity.config.behavior_lines import all_to_hydra_syntax, dotted_options, to_hydra_syntax
 from mappo_unity.config.compose import compose_config, compose_plain, load_config
-from mappo_unity.config.overrides import given, parse, shell_argument
+from mappo_unity.config.overrides import last_value, parse, shell_argument
 from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, PlayConfig
 from mappo_unity.config.text_lines import key_name, key_spelling, literal_lines
 from mappo_unity.errors import ConfigError
@@ -109,7 +109,7 @@ def test_a_training_takes_a_path_as_it_is(name: str) -> None:
     composed = compose_config(["env=unity", *lines])
     config = composed.config
     assert [config.env.file_name, config.env.player_logs, config.env.registry] == [name] * 3
-    assert [config.output_dir, config.resume, given(lines, "resume")] == [name] * 3
+    assert [config.output_dir, config.resume, last_value(lines, "resume")] == [name] * 3
     assert composed.run_dir == Path(name)
 
 
@@ -145,7 +145,7 @@ def test_a_text_that_is_not_utf8_is_refused() -> None:
 )
 def test_values_in_any_letters_are_read(line: str, value: Any) -> None:
     (override,) = parse([line])
-    assert readable_line(readable_line(line)) == readable_line(line)
+    assert to_hydra_syntax(to_hydra_syntax(line)) == to_hydra_syntax(line)
     if value is None:
         assert compose_config([line]).config.env.params == {"größe": 3}
         return
@@ -164,7 +164,7 @@ def test_several_values_in_any_letters_are_several() -> None:
         "/c/d",
     ]
     (line,) = literal_lines(["output_dir=a,b"], Config, sweep=True)
-    assert given([line], "output_dir") == "a,b"
+    assert last_value([line], "output_dir") == "a,b"
 
 
 @pytest.mark.parametrize("name", ["ボール", "My Ball", "Türe (2), rot", "100%", "3D-Ball", "a/b"])
@@ -189,7 +189,7 @@ def test_behaviors_and_parameters_may_have_any_letters() -> None:
         "Tür, rot": {"model": {"hidden": [8]}},
     }
     assert config.env.params == {"größe": 3, "wind": {"höhe": {"x": 1}}, "mass": 2}
-    lines = readable_lines(["behaviors.ボール.ppo.lr=1e-4,1e-3"])
+    lines = all_to_hydra_syntax(["behaviors.ボール.ppo.lr=1e-4,1e-3"])
     (override,) = parse(lines)
     tables = [dotted_options(f"behaviors={text}") for text in override.sweep_string_iterator()]
     assert [list(table) for table in tables] == [["behaviors.ボール.ppo.lr"]] * 2

@@ -30,17 +30,17 @@ _READABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*|0|[1-9][0-9]*")
 _NULL = re.compile(r"(?<![\w.-])null(?![\w.-])", re.IGNORECASE)
 
 
-def readable_line(line: str) -> str:
+def to_hydra_syntax(line: str) -> str:
     """Return an override in a form that Hydra reads; most are returned as they are.
 
     Raises:
         HydraException: its value cannot be read.
         ConfigError: an interval below such a name.
     """
-    return readable_lines([line])[0]
+    return all_to_hydra_syntax([line])[0]
 
 
-def readable_lines(lines: list[str]) -> list[str]:
+def all_to_hydra_syntax(lines: list[str]) -> list[str]:
     """Return overrides in a form that Hydra reads, with one dictionary for all names of an option if need be.
 
     One, since Hydra's sweepers keep a single override of a key. Several values make all combinations.
@@ -49,13 +49,13 @@ def readable_lines(lines: list[str]) -> list[str]:
         HydraException: a value cannot be read.
         ConfigError: an interval below such a name.
     """
-    lines = [_readable_value(line) for line in lines]
+    lines = [_value_to_hydra_syntax(line) for line in lines]
     for root in OPEN:
         lines = _with_one_dictionary(lines, root)
     return lines
 
 
-def _readable_value(line: str) -> str:
+def _value_to_hydra_syntax(line: str) -> str:
     key, equals, value = line.partition("=")
     choices = group_choices().get(key, [])
     if NO_CHOICE in choices:

@@ -23,10 +23,10 @@ from mappo_unity.config.option_table import option_table
 from mappo_unity.config.options_file import file_root
 from mappo_unity.config.overrides import (
     SWEEP_EXTRA,
+    add_plus_prefix,
     check_overrides,
     check_value,
     given_options,
-    open_line,
     parse,
 )
 from mappo_unity.config.plain_options import check_form
@@ -67,7 +67,7 @@ def compose_config(lines: list[str], base: Path | None = None, file: Path | None
     `file` go on top of them. Raises ConfigError.
     """
     check_overrides(lines, Config, group_choices())
-    lines = [open_line(line) for line in lines]
+    lines = [add_plus_prefix(line) for line in lines]
     name = register_root(lines, base, file)
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):

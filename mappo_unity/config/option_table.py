@@ -37,9 +37,9 @@ class Option:
         return get_origin(without_none(self.type)) is dict
 
     @property
-    def wanted(self) -> str:
+    def accepts(self) -> str:
         """Say in words which values the option takes."""
-        return wanted(self.type)
+        return describe_type(self.type)
 
 
 @cache
@@ -94,11 +94,11 @@ def with_article(name: str) -> str:
     return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
 
 
-def wanted(hint: Any) -> str:
+def describe_type(hint: Any) -> str:
     """Say in words which values a type takes: ``Optional[int]`` -> "a whole number or null"."""
     inner = without_none(hint)
     if inner is not hint:
-        return f"{wanted(inner)} or null"
+        return f"{describe_type(inner)} or null"
     if get_origin(hint) is list:
         (item,) = get_args(hint)
         if _is_enum(item):

@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from mappo_unity.config import presets
-from mappo_unity.config.overrides import check_value, given, shell_word
+from mappo_unity.config.overrides import check_value, last_value, shell_word
 from mappo_unity.config.renamed import rename_keys
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
@@ -39,7 +39,7 @@ def take_file(lines: list[str]) -> tuple[list[str], Path | None]:
         raise ConfigError(f"{SWITCH} is given {len(files)} times ({', '.join(files)}): one file is taken")
     if files and not files[0]:
         raise ConfigError(f"{SWITCH} names no file: {_typed('my.yaml')}")
-    if files and given(rest, "resume") is not None:
+    if files and last_value(rest, "resume") is not None:
         raise ConfigError(
             f"{SWITCH} and resume cannot go together: a run goes on with the options in its own config.yaml; "
             "give those that change as option=value"
@@ -56,13 +56,13 @@ def file_root(path: Path, lines: list[str]) -> dict[Any, Any]:
     root: Any = OmegaConf.to_container(OmegaConf.load(presets.conf_dir() / "config.yaml"))
     entries = [_chosen(entry, choices) for entry in root.pop("defaults")]
     own_env = options.get("env", {}).get("name")
-    chosen = given(lines, "env")
+    chosen = last_value(lines, "env")
     if chosen is not None and own_env is not None and chosen != own_env:
         raise ConfigError(
             f"env={chosen} differs from env.name={own_env} in {path}: leave one of them out "
             "(without env.name the file's other options go with any env)"
         )
-    if given(lines, "recipe") is not None:
+    if last_value(lines, "recipe") is not None:
         entries.remove("_self_")
         entries.insert(1 + [_group(entry) for entry in entries].index("env"), "_self_")
     return {"defaults": entries, **root, **options}

@@ -23,7 +23,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mappo_unity.config.behavior_lines import readable_line
+from mappo_unity.config.behavior_lines import to_hydra_syntax
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table, show_value
 from mappo_unity.config.presets import describe_choices
@@ -40,7 +40,7 @@ LARGEST = 2**63 - 1
 """The largest whole number that files and tensors hold."""
 
 
-def given(lines: list[str], key: str) -> Any:
+def last_value(lines: list[str], key: str) -> Any:
     """Return the value that the overrides give to a key (the last one), or None."""
     values = [item.value() for item in parse(lines) if item.key_or_group == key and not item.is_delete()]
     return _unescaped(values[-1]) if values else None
@@ -62,9 +62,9 @@ def parse(lines: list[str]) -> list[Override]:
     return [_parse_line(line) for line in lines]
 
 
-def open_line(line: str) -> str:
+def add_plus_prefix(line: str) -> str:
     """Let new names below an open option do without Hydra's plus signs: ``env.params.mass=2``."""
-    line = readable_line(line)
+    line = to_hydra_syntax(line)
     match = LINE.fullmatch(line)
     option = find_option(option_table(Config), match["key"]) if match else None
     is_new = match is not None and match["prefix"] is None and option is not None and option.is_open
@@ -148,7 +148,7 @@ def _parse_line(line: str) -> Override:
         )
     key = line.partition("=")[0].lstrip("+~")
     try:
-        text = readable_line(line)
+        text = to_hydra_syntax(line)
         _check_form(text, line)
         return OverridesParser.create().parse_override(text)
     except HydraException as error:
@@ -228,9 +228,9 @@ def _check_type(key: str, value: Any, option: Option, schema: type) -> None:
     if fits:
         return
     whole = isinstance(value, float) and value.is_integer()
-    hint = f"; write {int(value)}" if whole and "whole number" in option.wanted else ""
+    hint = f"; write {int(value)}" if whole and "whole number" in option.accepts else ""
     raise ConfigError(
-        f"{key}={show_value(value)} does not fit: {key} must be {option.wanted}{hint} ({option.description})"
+        f"{key}={show_value(value)} does not fit: {key} must be {option.accepts}{hint} ({option.description})"
     )
 
 
@@ -238,7 +238,7 @@ def _check_size(key: str, value: Any, option: Option) -> None:
     """Refuse whole numbers that no counter holds; elsewhere they would end in a traceback."""
     for number in value if isinstance(value, list) else [value]:
         is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
-        if is_number and "whole number" in option.wanted and LARGEST < abs(number) < math.inf:
+        if is_number and "whole number" in option.accepts and LARGEST < abs(number) < math.inf:
             raise ConfigError(
                 f"{key}={show_value(value)} is out of range: whole numbers are at most {LARGEST} "
                 f"({option.description})"

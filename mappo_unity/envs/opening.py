@@ -52,7 +52,7 @@ def first_results(env: BaseEnv, max_steps: int) -> dict[str, First]:
         else "behavior_specs stayed empty"
     )
     raise EnvironmentDataError(
-        f"the environment shows no behavior with an agent that asks for a decision: {what} in {max_steps} "
+        f"the environment shows no behavior with an agent that requests a decision: {what} in {max_steps} "
         "steps after reset()"
     )
 

@@ -36,7 +36,7 @@ class Episode(NamedTuple):
 
 
 @dataclass
-class BehaviorRounds:
+class BehaviorState:
     """Gather the records of one behavior, round by round."""
 
     name: str
@@ -69,7 +69,7 @@ class BehaviorRounds:
         self.terminated = np.zeros(count, bool)
         self.truncated = np.zeros(count, bool)
         self.acting = np.zeros(count, bool)
-        self.cut_off = np.zeros(count, bool)  # slots whose episode `drop` cut off in this round
+        self.crashed = np.zeros(count, bool)  # slots whose episode `mark_crashed` named in this round
         self.order = np.zeros(0, np.int64)
         self._terminal_obs: list[tuple[np.ndarray, list[np.ndarray]]] = []
 
@@ -80,15 +80,15 @@ class BehaviorRounds:
         if len(decision):
             self._add_decision(decision)
 
-    def drop(self, agent_ids: np.ndarray) -> None:
-        """Mark agents whose episodes a failed player took along, before `add` ends them: they do not count.
+    def mark_crashed(self, agent_ids: np.ndarray) -> None:
+        """Mark agents whose player crashed, before `add` ends their episodes: these do not count.
 
         Members of their teams that departed earlier go with them.
         """
         slots = self.slots.lookup(agent_ids)
-        self.cut_off[slots[slots >= 0]] = True
-        teams = self.cut_off.reshape(-1, self.slots.team_size).any(1)
-        self.cut_off |= self.departed & np.repeat(teams, self.slots.team_size)
+        self.crashed[slots[slots >= 0]] = True
+        teams = self.crashed.reshape(-1, self.slots.team_size).any(1)
+        self.crashed |= self.departed & np.repeat(teams, self.slots.team_size)
 
     def end_round(self) -> None:
         """Fix `end_obs`: the terminal observation where an episode ended, else the newest."""
@@ -190,7 +190,7 @@ class BehaviorRounds:
         self.individual_return[rows] += reward
         self.group_return[rows] += group_reward
         for agent, slot, cut in zip(self.slots.agents_of(rows), rows.tolist(), interrupted.tolist()):
-            if self.cut_off[slot]:
+            if self.crashed[slot]:
                 continue
             returns = float(self.individual_return[slot]), float(self.group_return[slot])
             self.finished.append(Episode(agent, *returns, int(self.length[slot]), bool(cut)))

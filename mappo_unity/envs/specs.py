@@ -12,11 +12,11 @@ import torch
 from torchrl.data import Binary, Bounded, Composite, MultiCategorical, Unbounded
 
 from mappo_unity import keys
-from mappo_unity.envs.rounds import BehaviorRounds
+from mappo_unity.envs.rounds import BehaviorState
 
 
 def make_specs(
-    behaviors: Mapping[str, BehaviorRounds], entry_of: Mapping[str, str], action_limit: float
+    behaviors: Mapping[str, BehaviorState], entry_of: Mapping[str, str], action_limit: float
 ) -> tuple[Composite, Composite, Composite, Composite]:
     """Return the specs of observations, actions, rewards and ends, an entry ``[G, A, ...]`` a behavior."""
     observation, action, reward, done = {}, {}, {}, {}
@@ -44,7 +44,7 @@ def make_specs(
     return Composite(observation), Composite(action), Composite(reward), Composite(done)
 
 
-def _action_spec(behavior: BehaviorRounds, shape: torch.Size, limit: float) -> Any:
+def _action_spec(behavior: BehaviorState, shape: torch.Size, limit: float) -> Any:
     spec = behavior.spec.action_spec
     size, branches = spec.continuous_size, spec.discrete_branches
     if not branches:

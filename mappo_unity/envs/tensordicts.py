@@ -9,15 +9,15 @@ import torch
 from tensordict import TensorDict
 
 from mappo_unity import keys
-from mappo_unity.envs.rounds import BehaviorRounds
+from mappo_unity.envs.rounds import BehaviorState
 
 
-def slot_shape(behavior: BehaviorRounds) -> torch.Size:
+def slot_shape(behavior: BehaviorState) -> torch.Size:
     """Return ``[G, A]``, teams and members of a team."""
     return torch.Size((behavior.slots.num_teams, behavior.slots.team_size))
 
 
-def root_entries(behavior: BehaviorRounds) -> TensorDict:
+def root_entries(behavior: BehaviorState) -> TensorDict:
     """Return what the agents are to act on now: entries as `reset` gives them, ends all False."""
     shape = slot_shape(behavior)
     # copies, because the behavior goes on writing into its newest observations
@@ -28,7 +28,7 @@ def root_entries(behavior: BehaviorRounds) -> TensorDict:
     return unchecked(entries, shape)
 
 
-def next_entries(behavior: BehaviorRounds) -> TensorDict:
+def next_entries(behavior: BehaviorState) -> TensorDict:
     """Return what the last round brought: last observations, rewards and ends."""
     shape = slot_shape(behavior)
     entries = _observe(behavior, behavior.end_obs)
@@ -45,7 +45,7 @@ def next_entries(behavior: BehaviorRounds) -> TensorDict:
     return unchecked(entries, shape)
 
 
-def _observe(behavior: BehaviorRounds, observations: list[np.ndarray]) -> dict[str, torch.Tensor]:
+def _observe(behavior: BehaviorState, observations: list[np.ndarray]) -> dict[str, torch.Tensor]:
     """Return the entries of the sensors, of the slots' flags, and the action mask where there is one."""
     shape = slot_shape(behavior)
     entries = {

@@ -23,7 +23,7 @@ from torchrl.envs import EnvBase
 
 from mappo_unity import keys
 from mappo_unity.envs.opening import first_results, team_sizes
-from mappo_unity.envs.rounds import BehaviorRounds, Episode
+from mappo_unity.envs.rounds import BehaviorState, Episode
 from mappo_unity.envs.slots import SlotTable
 from mappo_unity.envs.specs import make_specs
 from mappo_unity.envs.tensordicts import next_entries, root_entries, slot_shape, unchecked
@@ -37,8 +37,8 @@ from mappo_unity.scenes.contract.rules import (
 )
 
 
-class CutOff(NamedTuple):
-    """Episodes that a failed player took along."""
+class CrashedEpisodes(NamedTuple):
+    """Episodes of one behavior that ended because their player crashed."""
 
     round: int  # the round in which they ended, see `UnityEnv.rounds`
     behavior: str
@@ -85,7 +85,7 @@ class UnityEnv(EnvBase):
     entry_of: dict[str, str]  # behavior -> TensorDict entry: the policy name where it has one side only
 
     @property
-    def behaviors(self) -> dict[str, BehaviorRounds]:
+    def behaviors(self) -> dict[str, BehaviorState]:
         """The behaviors by name; their specs, slots and arrays."""
         return self._behaviors
 
@@ -96,7 +96,7 @@ class UnityEnv(EnvBase):
             behavior.finished = []
         return out
 
-    _cut_off: list[CutOff]
+    _crashed: list[CrashedEpisodes]
     rounds: int = 0  # rounds played since the environment was opened
 
     @property
@@ -104,10 +104,10 @@ class UnityEnv(EnvBase):
         """How often players were started again; None for a BaseEnv that is no player."""
         return getattr(self.base_env, "restarts", None)
 
-    def pop_cut_off(self) -> list[CutOff]:
-        """Return the episodes cut off by failed players since the last call."""
-        out: list[CutOff] = self._cut_off
-        self._cut_off = []
+    def pop_crashed_episodes(self) -> list[CrashedEpisodes]:
+        """Return the episodes that crashed players ended since the last call."""
+        out: list[CrashedEpisodes] = self._crashed
+        self._crashed = []
         return out
 
     def get_state(self) -> dict[str, Any] | None:
@@ -157,7 +157,7 @@ class UnityEnv(EnvBase):
             behavior.begin_round()
         self._untouched = False
         self._play_until_asked()
-        self._note_cut_off()
+        self._note_crashed()
         self.rounds += 1
         following = {self.entry_of[name]: next_entries(b) for name, b in self._behaviors.items()}
         return unchecked(following, self.batch_size)
@@ -168,8 +168,8 @@ class UnityEnv(EnvBase):
 
     def _open(self, seed: int) -> None:
         self.base_env = self._make_env(int(seed))
-        self._behaviors: dict[str, BehaviorRounds] = {}
-        self._cut_off = []
+        self._behaviors: dict[str, BehaviorState] = {}
+        self._crashed = []
         try:
             self.base_env.reset()
             self._first_results()
@@ -207,22 +207,22 @@ class UnityEnv(EnvBase):
 
     def _take_results(self) -> bool:
         """Take in what the behaviors' agents report; return whether somebody asks."""
-        cut_off = getattr(self.base_env, "cut_off", None)  # a restarted player's, see link.restarts
+        crashed = getattr(self.base_env, "crashed_agents", None)  # only players have it, see RestartingPlayer
         asked = False
 
         for name, behavior in self._behaviors.items():
             decision, terminal = self._checks[name](self.base_env.get_steps(name))
-            if cut_off and name in cut_off:
-                behavior.drop(cut_off[name])
+            if crashed and name in crashed:
+                behavior.mark_crashed(crashed[name])
             behavior.add(decision, terminal)
             asked = asked or len(decision) > 0
         return asked
 
-    def _note_cut_off(self) -> None:
+    def _note_crashed(self) -> None:
         for name, behavior in self._behaviors.items():
-            if np.count_nonzero(behavior.cut_off):
-                slots = behavior.cut_off.reshape(slot_shape(behavior)).copy()
-                self._cut_off.append(CutOff(self.rounds, name, slots))
+            if np.count_nonzero(behavior.crashed):
+                slots = behavior.crashed.reshape(slot_shape(behavior)).copy()
+                self._crashed.append(CrashedEpisodes(self.rounds, name, slots))
 
     def _first_results(self) -> None:
         """Read the behaviors and how many teams and agents they have from the first records."""
@@ -233,7 +233,7 @@ class UnityEnv(EnvBase):
         for name, sizes in team_sizes(first).items():
             teams, members = (limit or seen for limit, seen in zip(self._limits, sizes))
             table = SlotTable(name, teams, members)
-            behavior = BehaviorRounds(name, self._specs[name], table, self.death_masking)
+            behavior = BehaviorState(name, self._specs[name], table, self.death_masking)
             behavior.add(first[name].decision, first[name].terminal)
             behavior.end_round()
             self._behaviors[name] = behavior

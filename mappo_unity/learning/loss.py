@@ -15,8 +15,8 @@ from mappo_unity import keys
 from mappo_unity.config.schema import PPOConfig, ValueLoss
 from mappo_unity.learning.advantage import masked_mean
 
-LEARNS = "learns"  # bool [rows, A, 1]: the slot acted and the outcome is known
-VALUED = "valued"  # bool [rows, A, 1]: the same, or its agent departed while a team mate acted
+ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: the slot acted and the outcome is known
+CRITIC_LEARNS = "critic_learns"  # bool [rows, A, 1]: the same, or its agent departed while a team mate acted
 
 
 class MaskedClipPPOLoss(ClipPPOLoss):
@@ -40,7 +40,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
             functional=False,
         )
         self.log_explained_variance = False
-        self.loss_mask_key = LEARNS
+        self.loss_mask_key = ACTOR_LEARNS
         self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
         self.log_ratio = self.entropy = torch.zeros(())
 
@@ -51,9 +51,9 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         return entropy
 
     def loss_critic(self, tensordict: TensorDictBase) -> Any:
-        """Return the critic's loss over all valued slots, in a shape that the mask of actions keeps."""
+        """Return the critic's loss over all slots with a value, in a shape that the mask of actions keeps."""
         loss, *rest = super().loss_critic(tensordict)
-        return masked_mean(loss, tensordict.get(VALUED)).expand(loss.shape), *rest
+        return masked_mean(loss, tensordict.get(CRITIC_LEARNS)).expand(loss.shape), *rest
 
     def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> Any:
         out = super()._log_weight(tensordict, adv_shape)

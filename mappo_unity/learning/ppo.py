@@ -24,7 +24,7 @@ from mappo_unity import keys
 from mappo_unity.config.schema import Optimizer, PPOConfig, ValueNormKind
 from mappo_unity.learning.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
 from mappo_unity.learning.encoders import RunningNorm
-from mappo_unity.learning.loss import LEARNS, VALUED, MaskedClipPPOLoss
+from mappo_unity.learning.loss import ACTOR_LEARNS, CRITIC_LEARNS, MaskedClipPPOLoss
 from mappo_unity.learning.value_norm import ValueNorm
 
 
@@ -32,7 +32,7 @@ class PolicyLearner:
     """Everything that learns for one policy name.
 
     Args:
-        actor, critic: see `models`.
+        actor, critic: see `learning.actor_critic`.
         cfg: the learner's options.
         max_rows: team rows of the largest batch.
         team_size: slots of a row.
@@ -102,8 +102,8 @@ class PolicyLearner:
             value,
             self._end_values(following, truncated),
             self._values(following[-1]),
-            valued(batch),
-            valued(following[-1]),
+            has_value(batch),
+            has_value(following[-1]),
             following.get(keys.TERMINATED),
             truncated,
             gamma=self.cfg.gamma,
@@ -120,7 +120,11 @@ class PolicyLearner:
         )
         entries = {key: batch.get(key) for key in self.row_keys}
         entries |= {keys.ADVANTAGE: advantage, keys.VALUE_TARGET: self.value_norm.normalize(estimate.target)}
-        entries |= {LEARNS: learns, VALUED: estimate.known, keys.VALUE: self.value_norm.normalize(value)}
+        entries |= {
+            ACTOR_LEARNS: learns,
+            CRITIC_LEARNS: estimate.known,
+            keys.VALUE: self.value_norm.normalize(value),
+        }
         rows = TensorDict(entries, batch.batch_size).flatten(0, -2)
         used = learns.flatten(0, -3).any(-2).squeeze(-1)
         return (rows if bool(used.all()) else rows[used]), metrics
@@ -197,7 +201,7 @@ class PolicyLearner:
         grad_norm = nn.utils.clip_grad_norm_(self.params, self.cfg.max_grad_norm, foreach=True)
         self.optimizer.step()
         with torch.no_grad():
-            mask, log_ratio = minibatch.get(LEARNS), self.loss.log_ratio
+            mask, log_ratio = minibatch.get(ACTOR_LEARNS), self.loss.log_ratio
             # k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative
             kl = masked_mean(torch.where(mask, log_ratio.exp() - 1 - log_ratio, 0.0), mask)
             clipped = masked_mean((log_ratio.exp() - 1).abs() > self.loss.clip_epsilon, mask)
@@ -256,7 +260,7 @@ def minibatch_rows(cfg: PPOConfig, rows: int, team_size: int) -> int:
     return min(rows, max(1, cfg.minibatch_size // team_size))
 
 
-def valued(entries: TensorDictBase) -> Tensor:
+def has_value(entries: TensorDictBase) -> Tensor:
     """Return which slots a value counts for: those that act, and departed ones while a team mate acts."""
     acting = entries.get(keys.ACTING)
     return acting | (entries.get(keys.DEPARTED) & acting.any(-2, keepdim=True))

@@ -48,7 +48,7 @@ def play(
             if name not in checks:
                 checks[name] = RecordCheck(name, env.behavior_specs[name])
             decision, terminal = checks[name](env.get_steps(name))
-            _drop_cut_off(env, name, running, counts)
+            _forget_crashed(env, name, running, counts)
             _end_episodes(name, terminal, running, counts)
             actor = policy[name] if isinstance(policy, dict) else policy
             actor.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
@@ -86,9 +86,9 @@ class _Counts:
         return all(len(self.ended.get(name, [])) >= self.wanted for name in names)
 
 
-def _drop_cut_off(env: BaseEnv, name: str, running: dict, counts: _Counts) -> None:
-    """Forget the episodes that a failed player took along (see `link.restarts`); others are begun instead."""
-    for agent in getattr(env, "cut_off", {}).get(name, ()):
+def _forget_crashed(env: BaseEnv, name: str, running: dict, counts: _Counts) -> None:
+    """Forget the episodes of agents whose player crashed (`RestartingPlayer`); others are begun instead."""
+    for agent in getattr(env, "crashed_agents", {}).get(name, ()):
         episode = running.pop((name, int(agent)), None)
         if episode is not None and episode[0]:
             counts.begun[name] -= 1

@@ -1,7 +1,7 @@
 """Matches between two policies in a two-sided scene, both sides in turn.
 
 In: a function that opens the environment, two policies. Out: wins, draws and losses with a
-confidence interval. A side is a team id (``Name?team=1``): its behaviors belong to one player.
+confidence interval. A side is a team id (``Name?team=1``): its behaviors belong to one policy.
 
 A match is one episode of a team. The side whose group reward (individual reward where there are no
 groups) is positive at its end has won, one with a negative one has lost; anything else is a draw.
@@ -26,7 +26,7 @@ Z95 = 1.959964  # two-sided 95 % quantile of the standard normal distribution
 
 @dataclass
 class Score:
-    """Outcomes of matches, seen from one player."""
+    """Outcomes of matches, seen from one policy."""
 
     wins: int = 0
     draws: int = 0
@@ -64,12 +64,12 @@ class Score:
 
 
 def play_matches(
-    make_env: MakeEnv, player: Policy, opponent: Policy, matches: int, seed: int
+    make_env: MakeEnv, policy: Policy, opponent: Policy, matches: int, seed: int
 ) -> dict[str, Score]:
     """Play ``matches`` matches, half of them with the sides swapped.
 
     Returns:
-        The player's score as each side, under the names of the side's behaviors.
+        The policy's score as each side, under the names of the side's behaviors.
 
     Raises:
         ConfigError: the environment has not two sides.
@@ -80,7 +80,7 @@ def play_matches(
         sides = find_sides(env)
         for index, side in enumerate(sides):
             own, other = sides[side], [b for s, names in sides.items() if s != side for b in names]
-            policies = dict.fromkeys(own, player) | dict.fromkeys(other, opponent)
+            policies = dict.fromkeys(own, policy) | dict.fromkeys(other, opponent)
             count = (matches + 1 - index) // 2
             scores["+".join(own)] = play_side(env, policies, own, max(1, count))
     finally:

@@ -80,7 +80,7 @@ def check_resumable(path: Path, option: str) -> None:
     run = next((folder for folder in path.parents if (folder / CONFIG).is_file()), None)
     instead = f"; its run: {shell_argument(option, run)}" if run is not None else ""
     if option == "resume":
-        reason = "it holds a policy, but not what a training run goes on with (optimizer, counters, critic)"
+        reason = "it holds a policy, but not what resuming needs (optimizer, counters, critic)"
         use = f"mappo-eval {shell_argument('run', path)} and mappo-play env=NAME "
         use += f"{shell_argument('policy', path)} play it"
     else:

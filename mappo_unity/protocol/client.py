@@ -4,7 +4,7 @@ In: `PlayerOptions` and a seed. Out: DecisionSteps and TerminalSteps. Differs fr
 mlagents_envs.environment.UnityEnvironment in that it listens on loopback only, takes a port that the system
 gives, decodes without a loop over numbers, refuses numbers that are not finite, and says what failed and
 where the log is, or what a player without one printed. A failure raises `PlayerFailure`, after which the
-player is gone; `restarts` starts another.
+player is gone; `RestartingPlayer` starts another.
 """
 
 from __future__ import annotations
@@ -232,7 +232,7 @@ class UnityPlayer(BaseEnv):
     def _check_alive(self) -> None:
         how = self.process.ended() if self.process is not None else None
         if how is not None:
-            when = "while it started" if self.handshake is None else "while the training ran"
+            when = "while it started" if self.handshake is None else "during the training run"
             raise self._failure(f"ended {when}: {how}")
 
     def _silence(self) -> str:

@@ -27,11 +27,11 @@ class SeveralPlayers(BaseEnv):
         return sum(player.restarts for player in self.players)
 
     @property
-    def cut_off(self) -> dict[str, np.ndarray]:
+    def crashed_agents(self) -> dict[str, np.ndarray]:
         """Agent ids of every behavior whose episodes the last result cut off."""
         out: dict[str, np.ndarray] = {}
         for p, player in enumerate(self.players):
-            for name, agents in player.cut_off.items():
+            for name, agents in player.crashed_agents.items():
                 out[name] = np.concatenate([out.get(name, agents[:0]), self._outward(agents, p)])
         return out
 

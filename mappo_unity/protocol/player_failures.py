@@ -25,7 +25,7 @@ def never_connected(options: PlayerOptions, port: int) -> str:
     if options.executable is None:
         return (
             f"did not connect to port {port} {limit}: press Play in a scene whose agents have "
-            "Behavior Type Default, and see that no other training is on that port"
+            "Behavior Type Default, and see that no other training run is on that port"
         )
     return (
         f"did not connect {limit}: it may need env.no_graphics=true on a machine without a display, wait "
@@ -35,7 +35,7 @@ def never_connected(options: PlayerOptions, port: int) -> str:
 
 def never_answered(timeout_s: float, has_behaviors: bool) -> str:
     """Say that a connected player fell silent; one that has shown no behavior may hold no agent that acts."""
-    hint = "" if has_behaviors else f": no agent asks for a decision; {NO_DECISION_HINT}"
+    hint = "" if has_behaviors else f": no agent requested a decision; {NO_DECISION_HINT}"
     return f"did not answer {_limit(timeout_s)}{hint}"
 
 

@@ -39,7 +39,7 @@ def check_port(port: int, option: str) -> None:
     state = port_state(port) if port else FREE
     if state == TAKEN:
         raise ConfigError(
-            f"port {port} of {ADDRESS} is in use: another training, or a game started by hand, holds it; "
+            f"port {port} of {ADDRESS} is in use: another training run, or a game started by hand, holds it; "
             f"end that one, or choose another port ({option}) on both sides"
         )
     if state == FORBIDDEN:

@@ -37,8 +37,8 @@ class RestartingPlayer(BaseEnv):
         max_restarts: restarts allowed over its life; one more failure is an EnvironmentFailure.
         name: for messages.
 
-    Attributes: `restarts`, how often a player was started again; `cut_off`, the agent ids (int32) of every
-    behavior whose episodes the last result cut off, empty nearly always.
+    Attributes: `restarts`, how often a player was started again; `crashed_agents`, for every behavior the ids
+    (int32) of the agents whose episodes crashed with the last result, empty nearly always.
     """
 
     def __init__(
@@ -47,10 +47,10 @@ class RestartingPlayer(BaseEnv):
         self._make_player, self._seed, self._name = make_player, seed, name
         self.max_restarts = max_restarts
         self.restarts = 0
-        self.cut_off: dict[str, np.ndarray] = {}
+        self.crashed_agents: dict[str, np.ndarray] = {}
         self._failures_in_a_row = self._good_steps = 0
         self._last: dict[str, dict[int, DecisionSteps]] = {}  # newest decision of every agent that plays
-        self._cut: dict[str, TerminalSteps] = {}
+        self._crashed_steps: dict[str, TerminalSteps] = {}
         self._specs = BehaviorMapping({})
         self.player: UnityPlayer = make_player(seed)
 
@@ -77,14 +77,14 @@ class RestartingPlayer(BaseEnv):
             ConfigError: the first player gave no first result.
             EnvironmentFailure: the restarts are used up.
         """
-        self.cut_off, self._cut = {}, {}
+        self.crashed_agents, self._crashed_steps = {}, {}
         try:
             self.player.receive()
         except PlayerFailure as failure:
             if not self._specs:
                 raise ConfigError(f"{self._name} cannot be started: {failure}") from failure
-            self._cut = self._cut_episodes()
-            self.cut_off = {name: steps.agent_id for name, steps in self._cut.items()}
+            self._crashed_steps = self._end_crashed_episodes()
+            self.crashed_agents = {name: steps.agent_id for name, steps in self._crashed_steps.items()}
             self._last.clear()
             self._start_another(failure)
         self._took_steps()
@@ -113,7 +113,7 @@ class RestartingPlayer(BaseEnv):
         else:  # the new player has not shown it yet
             spec = self._specs[behavior_name]
             decision, terminal = DecisionSteps.empty(spec), TerminalSteps.empty(spec)
-        return decision, self._cut.get(behavior_name, terminal)
+        return decision, self._crashed_steps.get(behavior_name, terminal)
 
     def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
         """Set the actions of all agents in the last decision steps, in their order."""
@@ -145,7 +145,7 @@ class RestartingPlayer(BaseEnv):
             if len(decision):
                 playing.update(dict.fromkeys(decision.agent_id.tolist(), decision))
 
-    def _cut_episodes(self) -> dict[str, TerminalSteps]:
+    def _end_crashed_episodes(self) -> dict[str, TerminalSteps]:
         """Return a terminal step for every agent whose episode the failure cuts off."""
         return {name: _interrupted(playing) for name, playing in self._last.items() if playing}
 

@@ -200,7 +200,9 @@ class Player:
             raise PlayerError(f"actions for behavior {name!r}, which no agent has shown")
         asked = len(self.env.get_steps(name)[0])
         if len(values) != asked:
-            raise PlayerError(f"{len(values)} actions for {asked} agents of {name!r} that asked")
+            raise PlayerError(
+                f"{len(values)} actions for {asked} agents of {name!r} that requested a decision"
+            )
         if asked:
             self.env.set_actions(name, encode.decode_actions(self.encoders[name].spec, values))
 

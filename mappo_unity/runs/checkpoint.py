@@ -49,8 +49,7 @@ def save(path: Path, state: dict[str, Any]) -> None:
     except (OSError, RuntimeError) as error:
         raise CheckpointError(
             f"checkpoint {path} could not be written: {error}; the checkpoints before it stay as they are. "
-            "Free some space or choose another output_dir, then continue with resume="
-            + str(path.parent.parent)
+            "Free some space or choose another output_dir, then resume with resume=" + str(path.parent.parent)
         ) from error
 
 

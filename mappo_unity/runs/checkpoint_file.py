@@ -67,7 +67,7 @@ def unreadable(path: Path, error: Exception) -> str:
 
 
 def newest_good(where: Path) -> tuple[Path, list[str]]:
-    """Return the checkpoint to continue from: the file itself, or a folder's newest good one.
+    """Return the checkpoint to resume from: the file itself, or a folder's newest good one.
 
     Returns:
         The path, and a line for each damaged file that was passed over.
@@ -83,7 +83,7 @@ def newest_good(where: Path) -> tuple[Path, list[str]]:
     else:
         raise CheckpointError(f"{where} does not exist: give a run folder or a checkpoint file")
     if not candidates:
-        raise CheckpointError(f"{where} holds no checkpoint ({FOLDER}/step_*.pt): nothing to continue from")
+        raise CheckpointError(f"{where} holds no checkpoint ({FOLDER}/step_*.pt): nothing to resume from")
     warnings: list[str] = []
     for path in candidates:
         try:

@@ -219,7 +219,7 @@ def _claim(wanted: Path, exact: bool) -> Path:
         if any(wanted.iterdir()):
             raise ConfigError(
                 f"the folder {wanted} is not empty, and nothing is overwritten: "
-                f"name another one, or continue the run in it with {shell_argument('resume', wanted)}"
+                f"name another one, or resume the run in it with {shell_argument('resume', wanted)}"
             )
         return wanted
     for count in range(10_000):

@@ -40,7 +40,7 @@ def _take(folder: Path, file: BinaryIO) -> str | None:
     except BlockingIOError as error:
         raise ConfigError(
             f"the run in {folder} is being trained by another process{_holder(file)}: wait for its end or "
-            "end it, then continue the run; mappo-eval, mappo-export and mappo-play can read it meanwhile"
+            "end it, then resume the run; mappo-eval, mappo-export and mappo-play can read it meanwhile"
         ) from error
     except OSError as error:
         return _no_lock(folder, error)

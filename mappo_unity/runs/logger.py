@@ -72,7 +72,7 @@ class RunLog:
                 self.message(note)
         elif metrics.exists():
             raise ConfigError(
-                f"{metrics} exists already; continue that run ({shell_argument('resume', folder)}) or take "
+                f"{metrics} exists already; resume that run ({shell_argument('resume', folder)}) or take "
                 "another folder"
             )
         folder.mkdir(parents=True, exist_ok=True)
@@ -114,9 +114,9 @@ class RunLog:
             )
         what = f"the metrics in {self._folder} cannot be written ({error.strerror or error})"
         if not any((self._folder / "checkpoints").glob("*.pt")):
-            return f"{what}, and there is no checkpoint yet to continue from: free some space and start again"
+            return f"{what}, and there is no checkpoint yet to resume from: free some space and start again"
         return (
-            f"{what}; the checkpoints there stay as they are. Free some space, then continue with "
+            f"{what}; the checkpoints there stay as they are. Free some space, then resume with "
             f"{shell_argument('resume', self._folder)}"
         )
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mappo_unity.config.compose import check_effect, compose_config, load_config
-from mappo_unity.config.overrides import given, parse
+from mappo_unity.config.overrides import last_value, parse
 from mappo_unity.config.presets import group_choices
 from mappo_unity.config.schema import Config
 from mappo_unity.config.text_lines import quoted
@@ -24,7 +24,7 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
     What says which run it is (env, env.name, the folders) cannot be overridden.
     """
     saved = load_config(base)
-    chosen = given(lines, "env")
+    chosen = last_value(lines, "env")
     if chosen is not None and chosen != saved.env.name:
         raise ConfigError(
             f"env={chosen} differs from the run's env={saved.env.name}: a run goes on in its own env; "
@@ -32,7 +32,7 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
         )
     rest = [line for line in lines if parse([line])[0].key_or_group != "env"]
     for key in ("env.name", "output_dir", "hydra.run.dir"):
-        if given(rest, key) is not None:
+        if last_value(rest, key) is not None:
             raise ConfigError(
                 f"{key} cannot change with resume: the run goes on in its own folder {base.parent}"
             )

@@ -1,6 +1,6 @@
-"""Take episodes that were cut off by a failure out of a batch.
+"""Take the episodes of crashed players out of a batch.
 
-In: a batch as collected, what `UnityEnv.pop_cut_off` says. Out: the batch, in which those episodes'
+In: a batch as collected, what `UnityEnv.pop_crashed_episodes` says. Out: the batch, in which those episodes'
 decisions are nobody's: they are not learned from and do not count. Knows nothing of players.
 """
 
@@ -13,23 +13,23 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from mappo_unity import keys
-from mappo_unity.envs.unity_env import CutOff, UnityEnv
+from mappo_unity.envs.unity_env import CrashedEpisodes, UnityEnv
 
 
-def mask_crashed_episodes(batch: TensorDictBase, cuts: Sequence[CutOff], env: UnityEnv) -> int:
-    """Set `acting` and `departed` to False in every row of the cut episodes; return how many rows acted.
+def mask_crashed_episodes(batch: TensorDictBase, crashes: Sequence[CrashedEpisodes], env: UnityEnv) -> int:
+    """Set `acting` and `departed` to False in every row of the crashed episodes; return how many rows acted.
 
     Args:
         batch: ``[T]``, one entry a policy name, whose last row is the environment's last round.
-        cuts: what was cut off in rounds of this batch.
+        crashes: which episodes crashed in rounds of this batch.
     """
     dropped = 0
-    for cut in cuts:
-        name = keys.policy_name(cut.behavior)
-        side = env.sides[name].index(cut.behavior) if len(env.sides[name]) > 1 else None
+    for crash in crashes:
+        name = keys.policy_name(crash.behavior)
+        side = env.sides[name].index(crash.behavior) if len(env.sides[name]) > 1 else None
         done = _of_side(batch.get(("next", name, keys.DONE)), side)
-        last = batch.shape[0] - env.rounds + cut.round
-        rows = episode_rows(done, last, torch.from_numpy(cut.slots).unsqueeze(-1))
+        last = batch.shape[0] - env.rounds + crash.round
+        rows = episode_rows(done, last, torch.from_numpy(crash.slots).unsqueeze(-1))
         for key in (keys.ACTING, keys.DEPARTED):
             flags = batch.get((name, key)).clone()
             own = _of_side(flags, side)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mappo_unity.config.compose import check_effect, compose_config
-from mappo_unity.config.overrides import given
+from mappo_unity.config.overrides import last_value
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.first_checks import check_environment
@@ -61,7 +61,7 @@ def launch(
         ConfigError: a mistake in the options, or what `train` raises.
     """
     show = _Show(console, after_iteration)
-    resume = given(lines, "resume")
+    resume = last_value(lines, "resume")
     if resume == "":
         raise ConfigError("resume= is empty: it must name a run folder or a checkpoint file")
     if resume is not None:
@@ -83,7 +83,7 @@ def _train_new(lines: list[str], file: Path | None, warn: Warn, show: _Show) -> 
         check_effect(lines, [composed.config])
         check_environment(composed.config)
 
-    folder = runs.create_folder(composed.run_dir, exact=given(lines, "hydra.run.dir") is not None)
+    folder = runs.create_folder(composed.run_dir, exact=last_value(lines, "hydra.run.dir") is not None)
     try:
         with _locked(folder.path, warn):
             typed = lines if file is None else [f"--config={file}", *lines]

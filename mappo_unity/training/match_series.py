@@ -59,12 +59,12 @@ class MatchSeries:
     ) -> dict[str, float]:
         """Play a series and return its figures; the random numbers of training stay untouched."""
         cfg = self._cfg
-        player = ActorPolicy(layout, actors, False, "the policy")
+        policy = ActorPolicy(layout, actors, False, "the policy")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(cfg.seed + agent_steps)
             make_env = make_env_function(cfg.env, self._folder / PLAYERS / "matches")
             seed = (cfg.seed + agent_steps) % 2**31
-            scores = play_matches(make_env, player, RandomPolicy(seed), cfg.matches.count, seed)
+            scores = play_matches(make_env, policy, RandomPolicy(seed), cfg.matches.count, seed)
         if self._interval_is_over(agent_steps):  # the last series leaves the rhythm of a longer run alone
             self._played_at = agent_steps
         total = sum(scores.values(), Score())

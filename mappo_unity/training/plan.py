@@ -16,9 +16,9 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from mappo_unity.config.behavior_lines import readable_lines
+from mappo_unity.config.behavior_lines import all_to_hydra_syntax
 from mappo_unity.config.compose import Composed, check_effect, compose_config, to_config
-from mappo_unity.config.overrides import check_overrides, given, parse, range_length
+from mappo_unity.config.overrides import check_overrides, last_value, parse, range_length
 from mappo_unity.config.presets import group_choices
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
@@ -47,9 +47,9 @@ def plan_jobs(
     `say` is told when the check takes a while. Raises ConfigError.
     """
     check_overrides(lines, Config, group_choices(), sweep=True)
-    if given(lines, "resume") is not None:
+    if last_value(lines, "resume") is not None:
         raise ConfigError("resume cannot be swept: continue one run at a time, without -m")
-    task = readable_lines([line for line in lines if not is_hydra(line)])
+    task = all_to_hydra_syntax([line for line in lines if not is_hydra(line)])
     hydra = [line for line in lines if is_hydra(line)]
     if is_search(lines):
         jobs = [[line for line in task if not parse([line])[0].is_sweep_override()]]
@@ -70,7 +70,7 @@ def plan_jobs(
 
 def is_search(lines: list[str]) -> bool:
     """Return whether a sweeper other than Hydra's grid decides on the jobs."""
-    return given(lines, "hydra/sweeper") not in (None, "basic")
+    return last_value(lines, "hydra/sweeper") not in (None, "basic")
 
 
 def is_hydra(line: str) -> bool:

@@ -72,9 +72,9 @@ class RunState:
         env = self.setup.env
         if env.restarts is None:
             return {}
-        crashed = env.pop_cut_off()
+        crashed = env.pop_crashed_episodes()
         self.dropped_steps += mask_crashed_episodes(batch, crashed, env)
-        self.dropped_episodes += sum(int(cut.slots.sum()) for cut in crashed)
+        self.dropped_episodes += sum(int(crash.slots.sum()) for crash in crashed)
         return {
             "restarts": float(self.restarts),
             "dropped_episodes": float(self.dropped_episodes),

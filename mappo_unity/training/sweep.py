@@ -22,9 +22,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from mappo_unity.config.behavior_lines import dotted_options, readable_lines
+from mappo_unity.config.behavior_lines import all_to_hydra_syntax, dotted_options
 from mappo_unity.config.compose import register_root, to_config
-from mappo_unity.config.overrides import given, open_line, parse
+from mappo_unity.config.overrides import add_plus_prefix, last_value, parse
 from mappo_unity.config.presets import conf_dir
 from mappo_unity.config.schema import Config
 from mappo_unity.config.text_lines import quoted_path
@@ -88,7 +88,7 @@ def run_sweep(lines: list[str], file: Path | None = None) -> SweepResult:
     folder = _sweep_folder(lines, plan)
     result, patience = SweepResult(folder.path), SweepSignalHandler()
     try:
-        with sweep_signals(patience, parallel=given(lines, "hydra/launcher") == "joblib"):
+        with sweep_signals(patience, parallel=last_value(lines, "hydra/launcher") == "joblib"):
             _launch(
                 [*_without(lines, "hydra.sweep.dir"), f"hydra.sweep.dir={quoted_path(folder.path)}"], file
             )
@@ -196,14 +196,14 @@ def _refuse_unstarted(folder: NewFolder, error: Exception) -> None:
 
 
 def _launch(lines: list[str], file: Path | None) -> None:
-    if given(lines, "hydra/sweeper") == "optuna":
+    if last_value(lines, "hydra/sweeper") == "optuna":
         _quieten()
     GlobalHydra.instance().clear()
     search_path = create_config_search_path(str(conf_dir()))
     hydra = Hydra.create_main_hydra2("mappo-train", search_path)
     try:
-        lines = [open_line(line) for line in readable_lines(lines)]
-        if all(given(lines, key) in (None, "basic") for key in ("hydra/sweeper", "hydra/launcher")):
+        lines = [add_plus_prefix(line) for line in all_to_hydra_syntax(lines)]
+        if all(last_value(lines, key) in (None, "basic") for key in ("hydra/sweeper", "hydra/launcher")):
             lines = [
                 "hydra.sweeper.max_batch_size=1",
                 *lines,
@@ -216,7 +216,7 @@ def _launch(lines: list[str], file: Path | None) -> None:
 def _sweep_folder(lines: list[str], plan: Plan) -> NewFolder:
     names = {config.env.name for config in plan.configs}
     name = names.pop() if len(names) == 1 else _SEVERAL
-    return create_folder(plan.first.sweep_dir(name), exact=given(lines, "hydra.sweep.dir") is not None)
+    return create_folder(plan.first.sweep_dir(name), exact=last_value(lines, "hydra.sweep.dir") is not None)
 
 
 def _read_results(folder: Path) -> list[JobResult]:

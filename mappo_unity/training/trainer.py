@@ -101,7 +101,7 @@ def _iterate(
         batch = next(batches)
         collected_s = time.perf_counter()
 
-        # Episodes that crashed players took along teach nothing and do not count.
+        # Episodes of crashed players teach nothing and do not count.
         crashed = state.mask_crashed(batch)
         learned = state.setup.learn(batch, progress=state.agent_steps / cfg.max_steps)
         learned_s = time.perf_counter()
