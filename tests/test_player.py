@@ -16,10 +16,10 @@ from fakes import vector_spec
 
 from mappo_unity.cli import player_main
 from mappo_unity.cli.player import run as main
+from mappo_unity.cli.player_log import PlayerLog
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol import decode, encode, messages
 from mappo_unity.protocol.batch_encoding import varint_columns
-from mappo_unity.protocol.player_log import PlayerLog
 from mappo_unity.protocol.serve import Player, env_function, play, serve
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.registry import BUILT_IN

@@ -15,9 +15,9 @@ def run(lines: list[str]) -> int:
     """Serve or build; return the exit code: 0 when the trainer closed, 1 after an error."""
     with interrupts_end("mappo-player"):
         from mappo_unity import __version__
+        from mappo_unity.cli.player_build import build
+        from mappo_unity.cli.player_log import PlayerLog
         from mappo_unity.protocol import messages
-        from mappo_unity.protocol.player_build import build
-        from mappo_unity.protocol.player_log import PlayerLog
         from mappo_unity.protocol.serve import Player, env_function, serve
 
     known, ignored = player_options.parse(lines)
