@@ -29,27 +29,29 @@ from mappo_unity.scenes import scene_names
 from mappo_unity.scenes.factory import check_factory
 from mappo_unity.scenes.mujoco_check import check_mujoco
 
-_FILE_ENDING = re.compile(
-    rf"\.(?!{SUFFIX[1:]}$)[A-Za-z][A-Za-z0-9]{{0,3}}"
-)  # of a file, not of "exports.v1.2"
+_FILE_ENDING = re.compile(rf"\.(?!{SUFFIX[1:]}$)[A-Za-z][A-Za-z0-9]{{0,3}}")
+"""An ending of files other than ONNX files; that of a folder such as exports.v1.2 is none."""
 
 
 def check_evaluation(cfg: EvalConfig) -> None:
     """Raise ConfigError if nothing can be evaluated with these options."""
+    check_mujoco()
     sources = [locate(cfg.run, "run")]
     if cfg.opponent is not None:
         sources.append(locate(cfg.opponent, "opponent"))
     known = [_open(source, cfg.deterministic) for source in sources]
+
     config = _environment(sources[0], known[0], cfg.env, "mappo-eval")
     try:
         check_environment(config)
     except ConfigError as error:
         if cfg.env is not None:
             raise
-        said = f"; so says {find_run(sources[0].path, 'run') / CONFIG}, where it can be changed"
-        told = ConfigError(f"{error}{said}")
+        file = find_run(sources[0].path, "run") / CONFIG  # mappo-eval takes no env.file_name and the like
+        told = ConfigError(f"{error}; so says {file}, where it can be changed")
         told.details = error.details
         raise told from error
+
     behaviors = _behaviors(config.env)
     if behaviors and cfg.opponent is not None:
         check_two_sides(behaviors)
