@@ -103,7 +103,7 @@ def test_every_field_of_the_schema_is_in_the_help_with_its_description() -> None
         assert " ".join(option.description.split()) in help_words, key
 
 
-NUMBERS = [key for key, option in OPTIONS.items() if "number" in option.describe_type]
+NUMBERS = [key for key, option in OPTIONS.items() if "number" in option.accepts]
 
 
 def test_numbers_compose_with_their_defaults() -> None:
