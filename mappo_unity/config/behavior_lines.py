@@ -79,7 +79,6 @@ def _with_one_dictionary(lines: list[str], root: str) -> list[str]:
 
     # several values of one line go with each of the others': all combinations
     trees: list[dict[str, Any]] = [{}]
-
     for line in lines:
         if _is_merged(line, root):
             choices = _trees(line)
@@ -118,7 +117,6 @@ def _trees(line: str) -> list[dict[str, Any]]:
 
     # the value alone: names that Hydra cannot read stand in the key
     override = OverridesParser.create().parse_override(f"{match['root']}={match['value']}")
-
     if not override.is_sweep_override():
         values: list[Any] = [override.value()]
     elif override.is_choice_sweep() or override.is_range_sweep():

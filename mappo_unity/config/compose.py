@@ -183,7 +183,6 @@ def _resumed_root(base: Path) -> dict[Any, Any]:
 
     # the recipe's own for the env
     official = {"optional official": f"${{recipe}}/{saved['env'].get('name')}"}
-
     quiet = [{"override hydra/job_logging": "none"}, {"override hydra/hydra_logging": "none"}]
 
     return {"defaults": ["schema", "_self_", *groups, official, *quiet], **saved}

@@ -26,9 +26,9 @@ def take_file(lines: list[str]) -> tuple[list[str], Path | None]:
     """Return the lines without ``--config FILE``, and the file; raise ConfigError if it is named wrongly."""
     rest: list[str] = []
     files: list[str] = []
+
     # an iterator, since --config takes the word behind it too
     left = iter(lines)
-
     for line in left:
         name, equals, value = line.partition("=")
         if name == SWITCH:
