@@ -93,11 +93,14 @@ def _answer(command: str, name: str, lines: list[str]) -> int:
     if any(line in ("--help", "-h") for line in lines):
         print(importlib.import_module(f"{__name__}.{command}").help_text())
         return 0
+
     if "--version" in lines:
         from mappo_unity import __version__
 
         print(f"{name} {__version__}")
         return 0
+
+    # a Ctrl-C that breaks an import off would end in a traceback of a half loaded module
     with interrupts_wait():
         module = importlib.import_module(f"{__name__}.{command}")
     return module.run(lines)

@@ -38,22 +38,28 @@ def diagnose(arguments: Sequence[str], say: Say) -> int:
         ConfigError: a mistake in the options, or no such file.
     """
     options = _parser().parse_args(arguments)
+
     check_range("--port", options.port, 1, 65535)
     check_duration("--timeout-s", options.timeout_s)
     check_duration("--seconds", options.seconds)
+
     for name, given in (("--no-graphics", options.no_graphics), ("--argument", options.argument)):
         if given and options.file_name is None:
             raise ConfigError(f"{name} is for a player that is started: it needs --file-name GAME")
+
     report = Report(say)
     report.head("installation")
     examine_packages(report)
+
     report.head("ports and display")
     examine_ports(report, options.port)
+
     if options.file_name is not None or options.editor:
         from mappo_unity.cli.doctor_player import examine_player
 
         report.head("Editor" if options.editor else "player")
         examine_player(report, options)
+
     report.head(f"{report.failures} failed, {report.warnings} to look at")
     return 1 if report.failures else 0
 
@@ -63,11 +69,13 @@ def examine_packages(report: Report) -> None:
     from mappo_unity import __version__
 
     report.good(f"mappo-unity {__version__}, Python {platform.python_version()}, {platform.platform()}")
+
     for name in PACKAGES:
         try:
             report.good(f"{name} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:
             report.fail(f"{name} is not installed", f"pip install {name}")
+
     from google.protobuf.internal import api_implementation
 
     kind = api_implementation.Type()
@@ -75,6 +83,7 @@ def examine_packages(report: Report) -> None:
         report.fail("protobuf runs in pure Python", CURES["protobuf"])
     else:
         report.good(f"protobuf is compiled ({kind})")
+
     try:
         check_mujoco()
     except ConfigError as error:
@@ -85,17 +94,20 @@ def examine_ports(report: Report, editor_port: int) -> None:
     """Report whether ports of the loopback address can be had, and whether there is a display."""
     try:
         with socket.socket() as free:
+            # port 0: any that is free
             free.bind(("127.0.0.1", 0))
             report.good(f"free ports for players, for example {free.getsockname()[1]}")
     except OSError as error:
         cure = "bring the loopback interface up: ip link set lo up"
         report.fail(f"no port of 127.0.0.1 can be had: {error}", cure)
+
     state = port_state(editor_port)
     if state == "free":
         report.good(f"port {editor_port} (Unity Editor) is free")
     else:
         what = "may not be listened on" if state == FORBIDDEN else "is taken"
         report.warn(f"port {editor_port} (Unity Editor) {what}", CURES[state])
+
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         report.warn("DISPLAY is not set", CURES["display"])
 
@@ -115,10 +127,12 @@ class _Parser(Parser):
         path = word.rpartition("=")[2]
         if word.startswith("-") or not path:
             return super().near(word)
+
         if (Path(path) / "config.yaml").is_file():
             return (
                 f": it looks at the installation and at games; mappo-eval run={shell_word(path)} tries a run"
             )
+
         return f" (did you mean --file-name {shell_word(path)}?)"
 
 
@@ -128,19 +142,23 @@ def _parser() -> argparse.ArgumentParser:
         description="Find out what keeps a Unity game from being trained on.",
         allow_abbrev=False,
     )
+
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         "--file-name", action=Once, metavar="GAME", help="a built Unity player, as env.file_name"
     )
     what.add_argument("--editor", action="store_true", help="wait for the Unity Editor")
+
     for name, kind, default, text in (
         ("--port", whole_number, EDITOR_PORT, "port for the Editor; default 5004"),
         ("--timeout-s", number, 60.0, "patience with the player; default 60"),
         ("--seconds", number, 2.0, "length of each speed test; default 2"),
     ):
         parser.add_argument(name, type=kind, action=Once, default=default, metavar="N", help=text)
+
     parser.add_argument("--no-graphics", action="store_true", help="start the player without graphics")
     parser.add_argument(
         "--argument", action="append", default=[], help="further argument of the player; --argument=--level"
     )
+
     return parser

@@ -35,6 +35,7 @@ def examine_player(report: Report, options: argparse.Namespace) -> None:
             report.good(f"executable {executable}")
     except ConfigError as error:  # says what to do
         return report.mistake(error)
+
     folder = Path(tempfile.mkdtemp(prefix="mappo-doctor-"))
     try:
         _examine_running(report, options, executable, folder / "Player.log")
@@ -59,6 +60,7 @@ def _examine_running(
         no_graphics=options.no_graphics,
         engine={"time_scale": 20.0},
     )
+
     player = UnityPlayer(settings)
     try:
         _examine_handshake(report, player)
@@ -77,12 +79,17 @@ def _cure_of(player: Any, error: Exception) -> str:
 
     if isinstance(error, ProtocolMismatch):
         return CURES["old package"]
+
     if player.handshake is not None and not player.behavior_specs:
         return CURES["no behavior"]
+
+    # nothing was started here: it is the Editor that was waited for
     if player.process is None:
         return f"see Unity's Console, or the Editor's log: {editor_log()}"
+
     if player.handshake is not None:
         return CURES["log"]  # the finding names it
+
     return (
         f"{CURES['display']}; the build must be for this system, must not wait for a user, and needs an "
         "agent with Behavior Type Default"
@@ -103,6 +110,7 @@ def _examine_handshake(report: Report, player: Any) -> None:
         f"handshake after {time.perf_counter() - begin:.1f} s: {shake.name or 'unnamed'}, package "
         f"{shake.package_version or 'unknown'}, protocol {shake.communication_version}"
     )
+
     from mappo_unity.protocol.messages import CAPABILITIES
 
     missing = [name for name in CAPABILITIES if not getattr(shake.capabilities, name)]
@@ -114,22 +122,29 @@ def _examine_handshake(report: Report, player: Any) -> None:
 
 def _examine_behaviors(report: Report, player: Any) -> bool:
     player.reset()
+
+    # behaviors show up with their first agent, which may ask some steps after the reset
     for _ in range(PATIENCE_STEPS):
         if any(len(player.get_steps(name)[0]) for name in player.behavior_specs):
             break
         player.step()
+
     if not player.behavior_specs:
         report.fail(f"no behavior within {PATIENCE_STEPS} steps", CURES["no behavior"])
         return False
+
     for name, spec in player.behavior_specs.items():
         report.good(f"behavior {name}: {_actions(spec.action_spec)}")
         for i, sensor in enumerate(spec.observation_specs):
             report.good(f"  obs_{i} {tuple(sensor.shape)} {sensor.name}")
+
         decision = player.get_steps(name)[0]
+        # group 0 stands for an agent without a team
         groups = sorted(set(map(int, decision.group_id)))
         alone = sum(int(group) == 0 for group in decision.group_id)
         teams = f"{len([g for g in groups if g])} teams" + (f", {alone} agents alone" if alone else "")
         report.good(f"  {len(decision)} agents ask: {teams}")
+
     return True
 
 
@@ -142,6 +157,7 @@ def _actions(spec: Any) -> str:
 
 def _examine_rhythm(report: Report, player: Any, steps: int = PATIENCE_STEPS) -> None:
     decisions = terminals = only_terminals = masked = 0
+
     for _ in range(steps):
         asked = ended = 0
         for name, spec in player.behavior_specs.items():
@@ -149,14 +165,17 @@ def _examine_rhythm(report: Report, player: Any, steps: int = PATIENCE_STEPS) ->
             asked, ended = asked + len(decision), ended + len(terminal)
             masked += sum(int(mask.sum()) for mask in decision.action_mask or [])
             player.set_actions(name, spec.action_spec.random_action(len(decision)))
+
         decisions, terminals = decisions + asked, terminals + ended
         only_terminals += int(not asked and ended > 0)
         player.step()
+
     if decisions:
         report.good(
             f"rhythm, random actions: {decisions / steps:.1f} decisions a step, {terminals} episodes ended, "
             f"{only_terminals} of {steps} steps with ends only, {masked} actions masked"
         )
+
     if decisions <= sum(len(player.get_steps(name)[0]) for name in player.behavior_specs):
         report.warn("nobody asked a second time", CURES["rhythm"])
 
@@ -177,7 +196,9 @@ def _examine_contract(report: Report, player: Any) -> None:
 def _examine_speed(report: Report, player: Any, seconds: float) -> None:
     for scale in TIME_SCALES:
         player.set_time_scale(scale)
+        # the new scale holds from this step on
         player.step()
+
         begin, steps, decisions = time.perf_counter(), 0, 0
         while (elapsed := time.perf_counter() - begin) < seconds:
             for name, spec in player.behavior_specs.items():
@@ -186,6 +207,7 @@ def _examine_speed(report: Report, player: Any, seconds: float) -> None:
                 decisions += count
             player.step()
             steps += 1
+
         report.good(
             f"time scale {scale:g}: {steps / elapsed:.0f} steps/s, "
             f"{decisions / elapsed:.0f} agent decisions/s"

@@ -26,6 +26,8 @@ def run(lines: list[str]) -> int:
         check_evaluation(config)
         options = vars(config)
         where = Path(options.pop("run"))
+
+        # torch comes only now: mistakes in the options are told at once
         from mappo_unity.policies.evaluate import evaluate
 
     result: dict[str, Any] = evaluate(where, **options)

@@ -24,6 +24,8 @@ def run(lines: list[str]) -> int:
 
         options = compose_plain(lines, ExportConfig)
         check_export(options)
+
+        # torch comes only now: mistakes in the options are told at once
         from mappo_unity.policies.export import export_checkpoint
 
     checkpoint = choose_checkpoint(Path(options.run))
@@ -32,4 +34,5 @@ def run(lines: list[str]) -> int:
             f"{file.path}: {file.policy} after {file.agent_steps:,} agent steps; plays as {checkpoint} does "
             f"(on {file.rows} observations: actions to {file.error:.1e}, samples in distribution)"
         )
+
     return 0

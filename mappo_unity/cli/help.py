@@ -93,22 +93,28 @@ def option_text(schema: type) -> str:
     """Return every option of a dataclass with type, default and description, section by section."""
     table = option_table(schema)
     lines = ["Options (name: type = default):"]
+
     sections = [option for option in table.values() if option.is_section]
     lines += [
         _option_text(option) for key, option in table.items() if "." not in key and option not in sections
     ]
+
     for section in sections:
         inside = [option for option in table.values() if option.key.rpartition(".")[0] == section.key]
         lines += ["", f"{section.key}.*  {section.description}"]
         lines += [_option_text(option) for option in inside if not option.is_section]
+
     return "\n".join(lines)
 
 
 def _option_text(option: Option) -> str:
     head = f"  {option.key}: {short_type(option.type)}"
     default = show_value(option.default)
+
+    # ??? marks what must be given, and has no default
     if default != "???":
         head += f" = {default}"
+
     return f"{head}\n{_wrap(option.description, 6)}"
 
 

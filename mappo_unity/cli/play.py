@@ -23,6 +23,8 @@ def run(lines: list[str]) -> int:
         options = compose_plain(lines, PlayConfig)
         check_screen(options)
         check_film(options)
+
+        # what is heavy comes only now: mistakes in the options are told at once
         from mappo_unity.cli.report import play_line
         from mappo_unity.viewing.play import play
 

@@ -21,16 +21,20 @@ def run(lines: list[str]) -> int:
         from mappo_unity.protocol.serve import Player, env_function, serve
 
     known, ignored = player_options.parse(lines)
+
     if known.scene == "build":
         player_options.check_build(known, ignored)
         make_env = env_function(ignored[0], known.num_areas, known.params)
         make_env(0, None).close()  # it starts with these options
         print(build(ignored[0], ignored[1], ignored[2:], known))
         return 0
+
     make_env = env_function(known.scene, known.num_areas, known.params)
     port = player_options.EDITOR_PORT if known.port is None else known.port
+
     with PlayerLog(known.log_file) as log:
         log(f"mappo-player {__version__}: {known.scene}, port {port}, protocol {messages.API_VERSION}")
         if ignored:
             log(f"accepted and without effect: {' '.join(ignored)}")
+
         return serve(Player(make_env, known.scene, log, png=not known.no_png), port, log)

@@ -22,8 +22,10 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
     """
     if rest:
         raise ConfigError(f"build takes a scene and a folder, not {' '.join(rest)}")
+
     name = scene.rpartition(":")[2] or scene
     path = _executable(Path(folder), name)
+
     command = [sys.executable, "-m", "mappo_unity.player", scene]
     if options.num_areas is not None:
         command += ["--num-areas", str(options.num_areas)]
@@ -31,15 +33,18 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
         command += ["--param", parameter]
     if options.no_png:
         command += ["--no-png"]
+
     file = next((above for above in path.parents if above.exists() and not above.is_dir()), None)
     if file is not None:
         raise ConfigError(f"{path} cannot be written: {file} is a file, not a folder")
+
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f'#!/bin/sh\nexec {shlex.join(command)} "$@"\n', encoding="utf-8")
         path.chmod(0o755)
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror}") from error
+
     return path
 
 
@@ -49,6 +54,8 @@ def _executable(folder: Path, name: str) -> Path:
             "mappo-player build writes a script, which ML-Agents cannot start on Windows; run mappo-player "
             f"{name} by hand and train with env.backend=editor"
         )
+
     if sys.platform == "darwin":
         return folder / f"{name}.app" / "Contents" / "MacOS" / name
+
     return folder / f"{name}.x86_64"

@@ -27,6 +27,7 @@ class PlayerLog:
     def __init__(self, path: str | None) -> None:
         self._name = f"-logFile {path}"
         self._works = False
+
         try:
             if path is None or path == "-":
                 self._name = "the log on standard output"

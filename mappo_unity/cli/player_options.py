@@ -23,11 +23,13 @@ def parse(lines: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     """
     parser = _parser()
     known, ignored = parser.parse_known_args(lines)
+
     _check_ignored(parser, lines, known.scene, ignored)
     if known.port is not None:
         check_range("--mlagents-port", known.port, 1, 65535)
     if known.num_areas is not None:
         check_range("--num-areas", known.num_areas, 1)
+
     known.params = dict(map(_parameter, known.param))
     return known, ignored
 
@@ -36,6 +38,7 @@ def check_build(known: argparse.Namespace, words: Sequence[str]) -> None:
     """Raise ConfigError if the arguments of mappo-player build are not a scene and a folder."""
     if len(words) < 2:
         raise ConfigError("build needs a scene and a folder: mappo-player build 3DBall builds")
+
     for option, given in (("--mlagents-port", known.port), ("-logFile", known.log_file)):
         if given is not None:
             raise ConfigError(f"{option} {given} has no effect on a build: its trainer gives it")
@@ -48,21 +51,26 @@ def help_text() -> str:
 
 def _parameter(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
+
     try:
         number = float(value)
     except ValueError:
         number = math.nan
+
     if not name or not math.isfinite(number):
         raise ConfigError(f"--param {text} is not of the form NAME=NUMBER")
+
     return name, int(number) if number.is_integer() else number  # num_threads and others want whole ones
 
 
 def _check_ignored(parser: Parser, lines: Sequence[str], scene: str, ignored: Sequence[str]) -> None:
     """Refuse what was meant for us; other arguments of Unity players have no effect here."""
+    # the word right behind the scene: a second scene, or a parameter without --param
     second = lines[1] if len(lines) > 1 and lines[0] == scene != "build" else "-"
     if not second.startswith("-"):
         form = f"; parameters are given as --param {second}" if "=" in second else ": one scene is served"
         raise ConfigError(f"{second!r} behind the scene {scene!r} is no option{form}")
+
     for word in ignored:
         if word.startswith("--") and parser.near(word):
             raise ConfigError(f"{word} is not an option of mappo-player{parser.near(word)}")
@@ -76,6 +84,7 @@ def _parser() -> Parser:
         "Other arguments of Unity players (-nographics, -batchmode ...) are accepted and have no effect.",
         allow_abbrev=False,
     )
+
     parser.add_argument("scene", metavar="SCENE", help="a scene's name, or package.module:function")
     parser.add_argument(
         "--mlagents-port",
@@ -95,4 +104,5 @@ def _parser() -> Parser:
     )
     parser.add_argument("--param", action="append", default=[], metavar="NAME=NUMBER")
     parser.add_argument("--no-png", action="store_true", help="send pictures as floats")
+
     return parser

@@ -39,12 +39,15 @@ def run_summary(outcome: Outcome, folder: Path) -> list[str]:
     """Return the closing lines of a run: figures, where the best policy is, what to type next."""
     rate = outcome.agent_steps / outcome.wall_s if outcome.wall_s > 0 else math.nan
     best = outcome.best_checkpoint or outcome.last_checkpoint
+
     lines = [
         f"{outcome.status}: {outcome.agent_steps:,} agent steps in {outcome.wall_s:,.1f} s ({rate:,.0f}/s), "
         f"mean return {show_number(outcome.return_mean)}"
     ]
+
     if best is not None:
         lines.append(f"best checkpoint: {best}")
+
     return [
         *lines,
         *_rollback_lines(outcome.updates),
@@ -59,13 +62,16 @@ def _rollback_lines(updates: dict[str, tuple[int, int]]) -> list[str]:
     rolled_back = {name: counts for name, counts in updates.items() if counts[0]}
     if not rolled_back:
         return []
+
     counts = ", ".join(f"{rolled:,} of {total:,} of {name}" for name, (rolled, total) in rolled_back.items())
     lines = [f"updates rolled back (what was collected for them taught nothing): {counts}"]
+
     if any(10 * rolled > total for rolled, total in rolled_back.values()):
         lines.append(
             "what helps: a smaller ppo.lr, fewer ppo.epochs, ppo.target_kl=0.02 (it ends an update early), "
             "a larger collect.batch_size, other ppo.num_minibatches; behaviors.NAME.ppo... for one policy"
         )
+
     return lines
 
 
@@ -73,6 +79,7 @@ def sweep_table(result: SweepResult) -> Table:
     """Return the jobs of a sweep as a table, best first."""
     options = varied_options(result.jobs)
     table = Table(title="Jobs, best first")
+
     table.add_column("job", justify="right")
     for option in options:
         table.add_column(option)
@@ -80,17 +87,22 @@ def sweep_table(result: SweepResult) -> Table:
         table.add_column(name, justify="right")
     table.add_column("status")
     table.add_column("error", overflow="fold")
+
     for job in result.jobs:
         values = [_short(job_options(job).get(option, "")) for option in options]
         table.add_row(str(job.job), *values, *_figures(job), job.status, job.error or "")
+
     return table
 
 
 def write_csv(result: SweepResult) -> Path:
     """Write the jobs of a sweep, best first, to results.csv in its folder; return the path."""
     path = result.folder / RESULTS
+
+    # the jobs may have set different options: a column for each, empty where a job did not
     options = list(dict.fromkeys(key for job in result.jobs for key in job_options(job)))
     figures = ["status", "return_mean", "agent_steps", "wall_s", "error"]
+
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, ["job", *options, *figures], restval="")
         writer.writeheader()
@@ -98,6 +110,7 @@ def write_csv(result: SweepResult) -> Path:
             writer.writerow(
                 {"job": job.job, **job_options(job), **{name: getattr(job, name) for name in figures}}
             )
+
     return path
 
 
@@ -106,10 +119,12 @@ def eval_table(result: dict[str, Any]) -> Table:
     table = Table(title="Evaluation")
     table.add_column("figure")
     table.add_column("value", justify="right")
+
     for name, value in _flat(result):
         above, dot, last = name.rpartition(".")
         label = _LABELS.get(last, last.replace("_", " "))
         table.add_row(above + dot + label, _percent(value) if last in _SHARES else show_number(value))
+
     return table
 
 
@@ -118,8 +133,10 @@ def play_line(result: dict[str, Any]) -> str:
     line = f"{result['video']}: " if result["video"] else ""
     line += f"{result['seconds']:.1f} s of {result['scene']} played by {result['policy']}, "
     line += f"{result['frames']} frames"
+
     if result["episodes"]:
         line += f"; {result['episodes']} agent episodes ended, mean return {result['mean_return']:.4g}"
+
     return line
 
 
@@ -134,6 +151,7 @@ def show_number(value: Any) -> str:
         return "-"
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return str(value)
+
     return (
         f"{value:,}" if isinstance(value, int) else f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.1f}"
     )
@@ -156,9 +174,11 @@ def _figures(job: JobResult) -> tuple[str, str, str]:
 
 def _flat(result: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     rows: list[tuple[str, Any]] = []
+
     for name, value in result.items():
         key = f"{prefix}{name}"
         rows += _flat(value, f"{key}.") if isinstance(value, dict) else [(key, value)]
+
     return rows
 
 

@@ -44,9 +44,11 @@ class Once(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         """Store the value."""
+        # a record of our own, since the namespace holds the defaults before anything is given
         given = vars(namespace).setdefault("given", {})
         if self.dest in given:
             parser.error(f"{option_string} is given twice, {given[self.dest]} and {values}: give it once")
+
         given[self.dest] = values
         setattr(namespace, self.dest, values)
 

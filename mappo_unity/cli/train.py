@@ -26,9 +26,12 @@ def run(lines: list[str]) -> int:
     from mappo_unity.config.text_lines import literal_lines
 
     lines = rename_lines(lines, lambda text: print(f"mappo-train: {text}", file=sys.stderr))
+
     options = [line for line in lines if line not in ("-m", "--multirun")]
     is_sweep = len(options) < len(lines)
+
     lines, file = take_file(literal_lines(options, Config, is_sweep))
+
     return _sweep(lines, file) if is_sweep else _train(lines, file)
 
 
@@ -46,8 +49,10 @@ def _train(lines: list[str], file: Path | None) -> int:
 
     outcome, folder = launched.outcome, launched.folder
     print("\n".join(run_summary(outcome, folder)), flush=True)
+
     if outcome.signal is None:
         return _MOST_ROLLED_BACK if outcome.status == "diverged" else 0
+
     name = _SIGNALS.get(outcome.signal, f"signal {outcome.signal}")
     print(
         f"mappo-train: ended by {name}; checkpoint {outcome.last_checkpoint}; "
@@ -62,13 +67,17 @@ def _sweep(lines: list[str], file: Path | None) -> int:
     from mappo_unity.training.sweep import run_sweep
 
     result = run_sweep(lines, file)
+    # the file before the table: a reader of the output that has gone must not cost it
     report.write_csv(result)
+
     console = report.console()
     console.print(report.sweep_table(result))
     console.print(f"sweep folder: {result.folder}", soft_wrap=True, highlight=False)
+
     for job in result.jobs:
         if job.error:
             print(f"mappo-train: job {job.job} failed: {job.error}", file=sys.stderr)
     if result.error:
         print(f"mappo-train: the sweep broke off: {result.error}", file=sys.stderr)
+
     return result.exit_code

@@ -26,11 +26,14 @@ def check_effect(given: Iterable[str], configs: list[Config]) -> None:
     """
     backends = list(dict.fromkeys(config.env.backend for config in configs))
     looked_at = {item.name: item.metadata.get(BACKENDS) for item in fields(EnvConfig)}
+
     for key in given:
         section, _, name = key.partition(".")
         needed = looked_at.get(name) if section == "env" else None
         if needed is None or set(needed) & set(backends):
             continue
+
+        # giving the default changes nothing, so it is no mistake with any backend
         default = getattr(EnvConfig(), name)
         for value in (getattr(config.env, name) for config in configs):
             if value != default:
@@ -42,6 +45,7 @@ def _message(key: str, value: Any, backends: list[Backend], needed: tuple[Backen
     names = [backend.value for backend in needed]
     wanted = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
     cure = "; give what the factory takes as env.params.NAME=..." if key == "env.num_areas" else ""
+
     return (
         f"{key}={show_value(value)} has no effect with env.backend={chosen}: "
         f"it needs env.backend={wanted}; or leave it out{cure}"

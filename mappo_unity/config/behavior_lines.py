@@ -58,25 +58,33 @@ def all_to_hydra_syntax(lines: list[str]) -> list[str]:
 def _value_to_hydra_syntax(line: str) -> str:
     key, equals, value = line.partition("=")
     choices = group_choices().get(key, [])
+
     if NO_CHOICE in choices:
         value = _NULL.sub(NO_CHOICE, value)
+
     override = parse_or_none(line) if choices and "glob" in value else None
     names: Any = None if override is None else override.value()
     if isinstance(names, Glob):  # which only Hydra's loader could expand
         value = ",".join(names.filter(choices))
+
     return f"{key}{equals}{quote_words(value)}"
 
 
 def _with_one_dictionary(lines: list[str], root: str) -> list[str]:
     if not any(_is_unreadable(line, root) for line in lines):
         return lines
+
     others = [line for line in lines if not _is_merged(line, root)]
     first = next(number for number, line in enumerate(lines) if _is_merged(line, root))
+
+    # several values of one line go with each of the others': all combinations
     trees: list[dict[str, Any]] = [{}]
     for line in lines:
         if _is_merged(line, root):
             choices = _trees(line)
             trees = [_merged(tree, choice) for tree in trees for choice in choices]
+
+    # the dictionary stands where the first of its lines stood
     return [*others[:first], f"++{root}={','.join(map(_written, trees))}", *others[first:]]
 
 
@@ -85,8 +93,10 @@ def dotted_options(line: str) -> dict[str, str]:
     key, _, text = line.partition("=")
     override = parse_or_none(line)
     value = None if override is None else override.value()
+
     if key in OPEN and isinstance(value, dict):
         return dict(_leaves(key, value))
+
     return {key: value if isinstance(value, str) else text}
 
 
@@ -104,6 +114,8 @@ def _is_merged(line: str, root: str) -> bool:
 def _trees(line: str) -> list[dict[str, Any]]:
     match = _LINE.fullmatch(line)
     assert match is not None
+
+    # the value alone: names that Hydra cannot read stand in the key
     override = OverridesParser.create().parse_override(f"{match['root']}={match['value']}")
     if not override.is_sweep_override():
         values: list[Any] = [override.value()]
@@ -111,12 +123,17 @@ def _trees(line: str) -> list[dict[str, Any]]:
         values = list(override.sweep_iterator())
     else:
         raise ConfigError(f"{line}: an interval is not taken for this name; give values: a,b,c")
+
+    # the last name is the innermost
     for key in reversed(match["inside"].split(".")[1:]):
         values = [{key: value} for value in values]
+
+    # a line without names below the option must bring them in its value
     trees = [value for value in values if isinstance(value, dict)]
     if len(trees) < len(values):
         root = match["root"]
         raise ConfigError(f"{line}: {root} must be named values, for example {OPEN[root]}")
+
     return trees
 
 
@@ -137,6 +154,7 @@ def _written(value: Any) -> str:
         return (
             "{" + ",".join(f"{key_spelling(str(key))}:{_written(item)}" for key, item in value.items()) + "}"
         )
+
     return show_value(value)
 
 
@@ -144,5 +162,6 @@ def _leaves(key: str, value: Any) -> Iterator[tuple[str, str]]:
     if not isinstance(value, dict):
         yield key, show_value(value)
         return
+
     for name, item in value.items():
         yield from _leaves(f"{key}.{key_name(str(name))}", item)

@@ -66,26 +66,33 @@ def compose_config(lines: list[str], base: Path | None = None, file: Path | None
     `base` is the config.yaml of a run that goes on; without it the presets are the base, and the options of
     `file` go on top of them. Raises ConfigError.
     """
+    # our checks come before Hydra's: they name the rule and the choices
     check_overrides(lines, Config, group_choices())
+
     lines = [add_plus_prefix(line) for line in lines]
     name = register_root(lines, base, file)
+
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
             tree = compose(name, lines, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error)) from error
+
     return Composed(to_config(tree), tree)
 
 
 def register_root(lines: list[str], base: Path | None = None, file: Path | None = None) -> str:
     """Register what the options start from, as `compose_config` says; return its name. Raises ConfigError."""
     store = register_schema()
+
     if base is not None:
         store.store(name="resumed", node=_resumed_root(base))
         return "resumed"
+
     if file is not None:
         store.store(name="from_file", node=file_root(file, lines))
         return "from_file"
+
     return "config"
 
 
@@ -97,12 +104,16 @@ def register_schema() -> ConfigStore:
     """
     Plugins.instance()  # imports the plugins, which register themselves
     store = ConfigStore.instance()
+
     for choice in SWEEP_EXTRA:
         group, _, name = choice.partition("=")
         nodes = store.repo["hydra"][group.partition("/")[2]]
+
+        # None: the plugin is not installed, or was moved by an earlier call
         node = nodes.pop(f"{name}.yaml", None)
         if node is not None:
             nodes[f"{name}_plugin.yaml"] = replace(node, name=f"{name}_plugin.yaml")
+
     store.store(name="schema", node=Config)
     return store
 
@@ -124,10 +135,12 @@ def to_config(tree: DictConfig) -> Config:
         tree.pop("hydra", None)
         for key in OPEN:
             _respell(tree, key)
+
     try:
         config = OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
         raise ConfigError(_explain(error)) from error
+
     assert isinstance(config, Config)
     return config
 
@@ -137,12 +150,16 @@ def compose_plain(lines: list[str], schema: type) -> Any:
     check_form(lines, schema)
     lines = literal_lines(lines, schema)
     check_overrides(lines, schema, {})
+
     tree = OmegaConf.structured(schema)
     for override in parse(lines):
         OmegaConf.update(tree, override.key_or_group, override.value(), merge=True)
+
+    # the first of the options that must be given
     for key in OmegaConf.missing_keys(tree):
         option = option_table(schema)[key]
         raise ConfigError(f"{key} is not given: {key}=... ({option.description})")
+
     try:
         return OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
@@ -156,15 +173,18 @@ def check_effect(lines: list[str], configs: list[Config]) -> None:
 
 def _resumed_root(base: Path) -> dict[Any, Any]:
     saved = _read_options(base)
+
+    # behind _self_, so that a recipe of the command line wins over what was saved; by itself none is chosen
     groups = [
         {group: NO_CHOICE if NO_CHOICE in names else None}
         for group, names in group_choices().items()
         if group != "env"
     ]
-    official = {
-        "optional official": f"${{recipe}}/{saved['env'].get('name')}"
-    }  # the recipe's own for the env
+
+    # the recipe's own for the env
+    official = {"optional official": f"${{recipe}}/{saved['env'].get('name')}"}
     quiet = [{"override hydra/job_logging": "none"}, {"override hydra/hydra_logging": "none"}]
+
     return {"defaults": ["schema", "_self_", *groups, official, *quiet], **saved}
 
 
@@ -186,25 +206,34 @@ def _read_options(path: Path) -> dict[Any, Any]:
         saved = OmegaConf.to_container(OmegaConf.load(path))
     except Exception as error:
         raise ConfigError(f"{path} cannot be read ({' '.join(str(error).split())})") from error
+
     if not isinstance(saved, dict) or not saved:
         raise ConfigError(f"{path} holds no options")
+
     missing = [key for key in _ALWAYS_SAVED if key not in saved]
     if missing:
         raise ConfigError(f"{path} is not complete: {' and '.join(missing)} missing")
+
+    # the run may be one of an earlier version
     saved = rename_keys(saved)
+
     for key, value in saved.items():
         try:
             check_value(str(key), value, Config)
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from error
+
     return saved
 
 
 def _explain(error: BaseException) -> str:
     texts = []
+
+    # Hydra wraps the error that says what is wrong: each message of the chain is told, once
     seen: BaseException | None = error
     while seen is not None:
         lines = [line.strip() for line in str(seen).splitlines() if line.strip()]
         texts.append("; ".join(line for line in lines if not line.startswith(_NOISE)))
         seen = seen.__cause__
+
     return ": ".join(dict.fromkeys(text for text in texts if text))

@@ -18,9 +18,12 @@ def install_command(extra: str) -> str:
     """Return what installs an extra: scripts/setup for a clone's own .venv, pip elsewhere."""
     is_here = Path.cwd() == ROOT
     setup = ROOT / "scripts" / "setup"
+
     if os.name == "posix" and setup.is_file() and Path(sys.prefix).resolve() == (ROOT / ".venv").resolve():
         return f"{'./scripts/setup' if is_here else shlex.quote(str(setup))} {extra}"
+
     if (ROOT / "pyproject.toml").is_file():  # a clone, in an environment of the user's
         place = "." if is_here else str(ROOT)
         return f"pip install --editable {shlex.quote(f'{place}[{extra}]')}"
+
     return f"pip install 'mappo-unity[{extra}]'"

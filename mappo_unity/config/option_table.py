@@ -47,6 +47,7 @@ def option_table(schema: type, prefix: str = "") -> dict[str, Option]:
     """Return every option and section of a dataclass by its full name, in the order of the source."""
     table: dict[str, Option] = {}
     hints, docs = get_type_hints(schema), _field_docs(schema)
+
     for item in fields(schema):
         key, hint = prefix + item.name, hints[item.name]
         default = item.default_factory() if item.default_factory is not MISSING else item.default
@@ -54,6 +55,7 @@ def option_table(schema: type, prefix: str = "") -> dict[str, Option]:
         table[key] = Option(key, hint, default, docs.get(item.name, ""), is_section)
         if is_section:
             table.update(option_table(hint, key + "."))
+
     return table
 
 
@@ -61,25 +63,35 @@ def find_option(table: dict[str, Option], key: str) -> Option | None:
     """Return the option that a key sets: itself, or the open option above it; None if there is none."""
     if key in table:
         return table[key]
+
+    # the nearest option above decides: below one that is not open there are no names
     parts = key.split(".")
     for length in range(len(parts) - 1, 0, -1):
         above = table.get(".".join(parts[:length]))
         if above is not None:
             return above if above.is_open else None
+
     return None
 
 
 def close_names(name: str, names: Iterable[str], count: int = 3) -> list[str]:
     """Return the names most like a misspelt one, best first: whole names, then last parts."""
     names = list(names)
+
+    # the right name in the wrong section, lr for ppo.lr
     last = name.rsplit(".", 1)[-1]
     same_last = [other for other in names if other.rsplit(".", 1)[-1] == last]
+
+    # the whole name misspelt
     lower = {other.lower(): other for other in names}
     alike = [lower[hit] for hit in difflib.get_close_matches(name.lower(), lower, count, 0.6)]
+
+    # the last part misspelt, whatever stands before it
     tails: dict[str, list[str]] = {}
     for other in names:
         tails.setdefault(other.rsplit(".", 1)[-1], []).append(other)
     by_tail = [other for hit in difflib.get_close_matches(last, tails, count, 0.75) for other in tails[hit]]
+
     return list(dict.fromkeys(same_last + alike + by_tail))[:count]
 
 
@@ -99,16 +111,20 @@ def describe_type(hint: Any) -> str:
     inner = without_none(hint)
     if inner is not hint:
         return f"{describe_type(inner)} or null"
+
     if get_origin(hint) is list:
         (item,) = get_args(hint)
         if _is_enum(item):
             return f"a list of any of {_members(item)}, for example [{next(iter(item)).name}]"
+
         example = "[128,128]" if item is int else "[a,b]"
         return f"a list of {_PLURALS.get(item, 'values')}, for example {example}"
+
     if get_origin(hint) is dict:
         return "named values, for example {name: 1}"
     if _is_enum(hint):
         return f"one of {_members(hint)}"
+
     return _WORDS.get(hint, str(hint))
 
 
@@ -117,10 +133,12 @@ def short_type(hint: Any) -> str:
     inner = without_none(hint)
     if inner is not hint:
         return f"{short_type(inner)} or null"
+
     if get_origin(hint) is list:
         return f"[{short_type(get_args(hint)[0])}]"
     if get_origin(hint) is dict:
         return "{name: value}"
+
     return (
         "|".join(member.name for member in hint) if _is_enum(hint) else getattr(hint, "__name__", str(hint))
     )
@@ -136,6 +154,7 @@ def show_value(value: Any) -> str:
         return "[" + ",".join(show_value(item) for item in value) + "]"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{name}: {show_value(item)}" for name, item in value.items()) + "}"
+
     return str(value)
 
 
@@ -163,11 +182,15 @@ def _module_docs(module: str) -> dict[str, dict[str, str]]:
 
 def _class_docs(node: ast.ClassDef) -> dict[str, str]:
     docs: dict[str, str] = {}
+
     for item, following in zip(node.body, node.body[1:], strict=False):
         if not (isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)):
             continue
+
+        # a field's docstring is the text right below it
         if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
             docs[item.target.id] = inspect.cleandoc(str(following.value.value))
+
     return docs
 
 

@@ -26,6 +26,8 @@ def take_file(lines: list[str]) -> tuple[list[str], Path | None]:
     """Return the lines without ``--config FILE``, and the file; raise ConfigError if it is named wrongly."""
     rest: list[str] = []
     files: list[str] = []
+
+    # an iterator, since --config takes the word behind it too
     left = iter(lines)
     for line in left:
         name, equals, value = line.partition("=")
@@ -35,15 +37,18 @@ def take_file(lines: list[str]) -> tuple[list[str], Path | None]:
             raise ConfigError(f"{line} alone says nothing: a file of options is given as {_typed(line)}")
         else:
             rest.append(line)
+
     if len(files) > 1:
         raise ConfigError(f"{SWITCH} is given {len(files)} times ({', '.join(files)}): one file is taken")
     if files and not files[0]:
         raise ConfigError(f"{SWITCH} names no file: {_typed('my.yaml')}")
+
     if files and last_value(rest, "resume") is not None:
         raise ConfigError(
             f"{SWITCH} and resume cannot go together: a run goes on with the options in its own config.yaml; "
             "give those that change as option=value"
         )
+
     return rest, Path(files[0]) if files else None
 
 
@@ -55,6 +60,7 @@ def file_root(path: Path, lines: list[str]) -> dict[Any, Any]:
     options, choices = _read(path)
     root: Any = OmegaConf.to_container(OmegaConf.load(presets.conf_dir() / "config.yaml"))
     entries = [_chosen(entry, choices) for entry in root.pop("defaults")]
+
     own_env = options.get("env", {}).get("name")
     chosen = last_value(lines, "env")
     if chosen is not None and own_env is not None and chosen != own_env:
@@ -62,9 +68,12 @@ def file_root(path: Path, lines: list[str]) -> dict[Any, Any]:
             f"env={chosen} differs from env.name={own_env} in {path}: leave one of them out "
             "(without env.name the file's other options go with any env)"
         )
+
+    # _self_ stands for the file's options: what comes behind it wins over them
     if last_value(lines, "recipe") is not None:
         entries.remove("_self_")
         entries.insert(1 + [_group(entry) for entry in entries].index("env"), "_self_")
+
     return {"defaults": entries, **root, **options}
 
 
@@ -76,25 +85,33 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
         raise ConfigError(f"{_typed(path)}: there is no such file") from error
     except Exception as error:
         raise ConfigError(f"{path} cannot be read ({' '.join(str(error).split())})") from error
+
     if not isinstance(saved, dict) or not saved:
         raise ConfigError(
             f"{path} holds no options: it must be YAML such as a run's config.yaml, ppo: {{lr: 1e-4}}"
         )
+
     saved = rename_keys(saved)
     if saved.pop("resume", None) is not None:
         raise ConfigError(f"{path}: resume belongs on the command line, mappo-train resume=RUN")
+
     try:
         choices = {group: _choice(group, saved.pop(group)) for group in _CHOICES if _is_name(saved, group)}
+
         tree = OmegaConf.create({})
         for key, value in saved.items():
             check_value(str(key), value, Config)
             OmegaConf.update(tree, str(key), value, merge=True)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
+
     options: Any = OmegaConf.to_container(tree)
+
+    # env.name alone chooses its preset too, if there is one of that name
     name = options.get("env", {}).get("name")
     if name in presets.group_choices()["env"]:
         choices.setdefault("env", name)
+
     return options, choices
 
 

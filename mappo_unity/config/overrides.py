@@ -81,6 +81,7 @@ def check_overrides(
     for line in lines:
         override = _parse_line(line)
         key = override.key_or_group
+
         if isinstance(override.value(), Glob):
             raise ConfigError(f"{line}: glob chooses presets (env, recipe); give {key}'s values: {key}=a,b,c")
         if override.is_sweep_override() and not groups:
@@ -90,6 +91,7 @@ def check_overrides(
                 f"{line}: several values for {key} make a sweep, which needs -m "
                 f"(mappo-train -m {shell_word(line)})"
             )
+
         if key.startswith(("hydra.", "hydra/")) and groups:
             _check_hydra(override, line)
             continue
@@ -103,11 +105,13 @@ def range_length(override: Override) -> int:
     """Return how many values a range has; raise ConfigError for one without end."""
     value = override.value()
     assert isinstance(value, RangeSweep) and value.start is not None and value.stop is not None
+
     if not value.step or not all(map(math.isfinite, (value.start, value.stop, value.step))):
         raise ConfigError(
             f"{override.input_line}: the range has no end (from {value.start} to {value.stop} in steps of "
             f"{value.step})"
         )
+
     return max(0, math.ceil((value.stop - value.start) / value.step))
 
 
@@ -117,6 +121,7 @@ def check_value(key: str, value: Any, schema: type) -> None:
     option = find_option(table, key)
     if option is None:
         raise ConfigError(_unknown(key, table, {}))
+
     if option.is_section:
         if not isinstance(value, dict):
             inside = ", ".join(_inside(key, table))
@@ -146,6 +151,7 @@ def _parse_line(line: str) -> Override:
             f"{line} is not an option: settings are written option=value (seed=1); --help lists the few "
             "switches there are"
         )
+
     key = line.partition("=")[0].lstrip("+~")
     try:
         text = to_hydra_syntax(line)
@@ -176,6 +182,7 @@ def _check_hydra(override: Override, line: str) -> None:
     if key.startswith("hydra/") and not isinstance(override.value(), str):
         choices = ", ".join(describe_choices(key)) or "see its documentation"
         raise ConfigError(f"{key}={show_value(override.value())} does not exist; choices: {choices}")
+
     package = SWEEP_EXTRA.get(line)
     if package is not None and not is_installed(f"hydra_plugins.{package}"):
         raise ConfigError(
@@ -197,6 +204,7 @@ def _check_choice(override: Override, choices: list[str]) -> None:
     if override.is_add() or override.is_force_add() or override.is_delete():
         name = override.value() if override.value() in choices else choices[-1]
         raise ConfigError(f"{override.input_line}: {group} is chosen without signs: {group}={name}")
+
     for value in _values(override):
         if isinstance(value, str) and value in choices or (value is None and group != "env"):
             continue
@@ -210,6 +218,7 @@ def _check_option(override: Override, line: str, schema: type, groups: dict[str,
     option = find_option(table, key)
     if option is None or override.package is not None:
         raise ConfigError(_unknown(key, table, groups))
+
     if override.is_delete():
         if not option.is_open or key == option.key:
             raise ConfigError(f"{line}: {key} cannot be deleted, only set: {key}=value")
@@ -220,6 +229,7 @@ def _check_option(override: Override, line: str, schema: type, groups: dict[str,
 
 def _check_type(key: str, value: Any, option: Option, schema: type) -> None:
     _check_size(key, value, option)
+    # OmegaConf by itself takes numbers and words such as yes for true and false
     fits = not (option.type is bool and not isinstance(value, bool))
     try:
         OmegaConf.update(_scratch(schema), key, value, merge=True, force_add=option.is_open)
@@ -227,6 +237,7 @@ def _check_type(key: str, value: Any, option: Option, schema: type) -> None:
         fits = False
     if fits:
         return
+
     whole = isinstance(value, float) and value.is_integer()
     hint = f"; write {int(value)}" if whole and "whole number" in option.accepts else ""
     raise ConfigError(
@@ -257,6 +268,7 @@ def _unknown(key: str, table: dict[str, Option], groups: dict[str, list[str]]) -
     if not inside:
         sections = [f"{name}.*" for name, option in table.items() if option.is_section]
         inside = [name for name in names if "." not in name] + sections
+
     choices = ", ".join(inside)
     return f"{key} is not an option{did_you_mean(key, names)}; choices: {choices} (--help describes them)"
 

@@ -31,6 +31,7 @@ def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:
             raise ConfigError(
                 f"behaviors.{name}: the environment has no behavior {name!r}; it has {', '.join(known)}"
             )
+
         behavior_config(cfg, name)
 
 
@@ -42,13 +43,16 @@ def behavior_config(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
     """
     own = cfg.behaviors.get(policy) or {}
     where = f"behaviors.{policy}"
+
     if not isinstance(own, dict):
         raise ConfigError(f"{where}={own!r} must hold sections, for example {where}.ppo.lr=1e-4")
+
     for section in own:
         if section not in SECTIONS:
             raise ConfigError(
                 f"{where}.{section}: only the sections {' and '.join(SECTIONS)} can differ by behavior"
             )
+
     model = _merged(cfg.model, own.get("model"), f"{where}.model")
     ppo = _merged(cfg.ppo, own.get("ppo"), f"{where}.ppo")
     return model, ppo
@@ -59,12 +63,15 @@ def _merged(section: Any, own: Any, where: str) -> Any:
         return section
     if not isinstance(own, dict):
         raise ConfigError(f"{where}={own!r} must hold options, for example {where}.lr=1e-4")
+
     names = [field.name for field in fields(section)]
     for name in own:
         if name not in names:
             close = difflib.get_close_matches(str(name), names, 3)
             hint = f"; did you mean {' or '.join(close)}?" if close else f"; there are {', '.join(names)}"
             raise ConfigError(f"{where}.{name}: there is no such option{hint}")
+
+    # the new object runs the section's own checks, on the values of both
     try:
         merged = OmegaConf.merge(OmegaConf.structured(section), own)
         assert isinstance(merged, DictConfig)

@@ -28,19 +28,24 @@ def check_form(lines: Sequence[str], schema: type) -> None:
     """Raise ConfigError for arguments that are not of the form option=value, or that give an option twice."""
     table = option_table(schema)
     seen: dict[str, str] = {}
+
     for number, line in enumerate(lines):
         key = line.partition("=")[0]
         if line.startswith("-"):
             raise ConfigError(_switch(lines, number, table))
         if "=" not in line:
             raise ConfigError(_word(lines, number, table))
+
         if key in seen:
             raise ConfigError(f"{key} is given twice, {seen[key]} and {line}: give it once")
         seen[key] = line
+
         if key not in table:
             _check_other_command(key, schema, table)
         if "${" in line:
             raise ConfigError(f"{line}: ${{...}} is for the options of mappo-train; write the value itself")
+
+    # only now: of switches and words alone the grammar's own message says too little
     for override, line in zip(parse(list(lines)), lines):
         if override.is_sweep_override():
             raise ConfigError(
@@ -53,10 +58,13 @@ def _check_other_command(key: str, schema: type, table: dict[str, Option]) -> No
     """Raise ConfigError for an option that another command has."""
     tables = {name: option_table(other) for name, other in _COMMANDS.items() if other is not schema}
     owners = [name for name, other in tables.items() if find_option(other, key) is not None]
+
     if key in group_choices() or key.startswith(("hydra.", "hydra/")):
         owners = ["mappo-train"]
+
     if not owners:
         return
+
     own = next((name for name, other in _COMMANDS.items() if other is schema), "this command")
     hint = ": a run's own options count" if owners == ["mappo-train"] else ""
     raise ConfigError(
@@ -69,8 +77,11 @@ def _switch(lines: Sequence[str], number: int, table: dict[str, Option]) -> str:
     key, equals, value = lines[number].partition("=")
     name = key.lstrip("-").replace("-", "_")
     rule = "options are written option=value, and the only switches are --help and --version"
+
     if name not in table:
         return f"{key} is not an option{_near(name, table)}: {rule}"
+
+    # --run=x has its value in it, --run x in the next word
     following = [value] if equals else lines[number + 1 : number + 2]
     return f"{key} is written {name}={_value(following, table[name])}: {rule}"
 
@@ -79,12 +90,16 @@ def _word(lines: Sequence[str], number: int, table: dict[str, Option]) -> str:
     """Say what a word alone may have been meant for: an option's name, or a value."""
     word = lines[number]
     rest = [line.removeprefix("=") for line in lines[number + 1 : number + 3] if line != "="]
+
     if word in table:
         value = _value(rest, table[word])
         return f"{word} has no value: it is written {word}={value}, without spaces"
+
+    # run:x
     name, colon, value = word.partition(":")
     if colon and name in table:
         return f"{word!r} is not of the form option=value: it is written {name}={shell_word(value)}"
+
     guess = f" (did you mean {next(iter(table))}={shell_word(word)}?)" if word else ""
     hint = _near(word, table) or guess
     return f"{word!r} is not of the form option=value{hint}; options: {', '.join(table)}"
@@ -100,5 +115,6 @@ def _value(following: Sequence[str], option: Option) -> str:
     """Return what may have been meant as an option's value: the next word, if it is one."""
     if option.type is bool:
         return "true"
+
     alone = [word for word in following[:1] if word and "=" not in word and not word.startswith("-")]
     return shell_word(alone[0]) if alone else "VALUE"

@@ -28,10 +28,12 @@ def conf_dir() -> Path:
 def group_choices() -> dict[str, list[str]]:
     """Return the choices of every group under conf/ (Hydra's own groups left out), sorted."""
     groups = {}
+
     for folder in sorted(path for path in conf_dir().iterdir() if path.is_dir() and path.name != "hydra"):
         names = sorted((path.stem for path in folder.glob("*.yaml")), key=str.lower)
         if names:
             groups[folder.name] = names
+
     return groups
 
 
@@ -51,9 +53,13 @@ def describe_choices(group: str) -> dict[str, str]:
 
 def _comment(path: Path) -> str:
     lines: list[str] = []
+
     for line in path.read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
             break
+
+        # @package is meant for Hydra
         if "@package" not in line:
             lines.append(line.lstrip("# "))
+
     return " ".join(lines)

@@ -12,12 +12,14 @@ RENAMED = {"log.backends": "log.loggers"}
 def rename_lines(lines: list[str], note: Callable[[str], None] = lambda text: None) -> list[str]:
     """Return override lines with today's names; `note` is told of each that had an old one."""
     out = []
+
     for line in lines:
         prefix = line[: len(line) - len(line.lstrip("+~"))]
         key, equals, value = line[len(prefix) :].partition("=")
         if key in RENAMED:
             note(f"note: {key} is called {RENAMED[key]} now")
         out.append(f"{prefix}{RENAMED.get(key, key)}{equals}{value}")
+
     return out
 
 
@@ -27,6 +29,8 @@ def rename_keys(options: dict[Any, Any]) -> dict[Any, Any]:
         section, _, name = old.partition(".")
         inside = options.get(section)
         if isinstance(inside, dict) and name in inside:
+            # where both names stand, today's wins
             kept = {key: value for key, value in inside.items() if key != name}
             options = options | {section: {new.partition(".")[2]: inside[name]} | kept}
+
     return options

@@ -147,6 +147,7 @@ class EnvConfig:
             raise ConfigError(
                 f"env.name={self.name!r} must consist of letters, digits, '_', '-' and '.': it names a folder"
             )
+
         _at_least("env.num_areas", self.num_areas, 1)
         _at_least("env.max_team_size", self.max_team_size, 1)
         _at_least("env.max_teams", self.max_teams, 1)
@@ -160,7 +161,9 @@ class EnvConfig:
         _at_least("env.target_frame_rate", self.target_frame_rate, -1)
         if self.port is not None:
             _within("env.port", self.port, 1, 65535)
+
         self._check_players()
+
         if self.backend is Backend.custom and not self.factory:
             raise ConfigError(
                 "env.factory is not given, but env.backend=custom needs it: "
@@ -175,14 +178,17 @@ class EnvConfig:
                 "env.file_name is not given, but env.backend=player needs it: the path of a built Unity "
                 "player, env.file_name=builds/Game (env.backend=editor trains in the Unity Editor instead)"
             )
+
         if (self.screen_width is None) != (self.screen_height is None):
             raise ConfigError("env.screen_width and env.screen_height belong together: give both or neither")
+
         if self.backend in (Backend.embedded, Backend.custom, Backend.editor) and self.num_players > 1:
             larger = " (env.num_areas makes it larger)" if self.backend is Backend.embedded else ""
             raise ConfigError(
                 f"env.num_players={self.num_players} needs env.backend=player or registry; with "
                 f"env.backend={self.backend.value} there is one environment{larger}"
             )
+
         if self.backend in (Backend.player, Backend.editor, Backend.registry):
             for name, value in self.params.items():
                 if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -223,6 +229,7 @@ class ModelConfig:
                     f"{option}={list(widths)} must be a list of at least one width, each >= 1, "
                     f"for example {option}=[128,128]"
                 )
+
         _within("model.init_log_std", self.init_log_std, -10, 3)
 
 
@@ -298,14 +305,17 @@ class PPOConfig:
         _within("ppo.gae_lambda", self.gae_lambda, 0, 1)
         _between("ppo.clip_epsilon", self.clip_epsilon, 0, 1)
         _between("ppo.clip_epsilon_final", self.clip_epsilon_final, 0, 1)
+
         _at_least("ppo.epochs", self.epochs, 1)
         _at_least("ppo.minibatch_size", self.minibatch_size, 1)
         _at_least("ppo.num_minibatches", self.num_minibatches, 1)
+
         _at_least("ppo.entropy_coef", self.entropy_coef, 0)
         _at_least("ppo.entropy_coef_final", self.entropy_coef_final, 0)
         _at_least("ppo.value_coef", self.value_coef, 0)
         _between("ppo.value_norm_beta", self.value_norm_beta, 0, 1)
         _above("ppo.huber_delta", self.huber_delta, 0)
+
         _above("ppo.max_grad_norm", self.max_grad_norm, 0)
         _above("ppo.target_kl", self.target_kl, 0)
         _above("ppo.max_kl", self.max_kl, 0)
@@ -409,6 +419,7 @@ class Config:
         _at_least("update_threads", self.update_threads, 1)
         _at_least("max_jobs", self.max_jobs, 1)
         _rule("stop_at_return", self.stop_at_return, True, "must be a finite number or null")
+
         kind, _, index = self.device.partition(":")
         if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
             raise ConfigError(f"device={self.device!r} must be one of cpu, cuda, cuda:N")
@@ -481,13 +492,16 @@ class PlayConfig:
         _not_empty(run=self.run, env=self.env, policy=self.policy, video=self.video)
         _above("seconds", self.seconds, 0)
         _within("seed", self.seed, 0, 2**31 - 1)
+
         for option, size in (("width", self.width), ("height", self.height)):
             _rule(option, size, 64 <= size <= 4096 and size % 2 == 0, "must be even and from 64 to 4096")
+
         if self.run is None and self.env is None:
             raise ConfigError(
                 "neither run nor env is given: run=FOLDER plays what was trained there, env=NAME random "
                 "actions, env=NAME policy=FILE.onnx an ONNX file"
             )
+
         if self.run is not None and self.policy is not None:
             raise ConfigError(f"run={self.run} and policy={self.policy} both say who plays: give one of them")
 

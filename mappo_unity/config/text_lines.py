@@ -23,9 +23,8 @@ ONE_FOLDER = ("resume", "output_dir", "hydra.run.dir", "hydra.sweep.dir")
 """Options that name one place, in a sweep too."""
 
 LINE = re.compile(r"(?P<prefix>\+\+|\+|~)?(?P<key>[^=+~\s]+)(?P<rest>=.*)?", re.DOTALL)
-_SIMPLE = re.compile(
-    r"(\.{0,2}/)?[A-Za-z_][A-Za-z0-9_./-]*"
-)  # what reads the same in Hydra's grammar, but for:
+# what reads the same in Hydra's grammar, but for the words below it
+_SIMPLE = re.compile(r"(\.{0,2}/)?[A-Za-z_][A-Za-z0-9_./-]*")
 _WORDS = ("null", "true", "false", "inf", "nan")
 _READABLE = re.compile(r"[A-Za-z0-9_/\-\\+.$%*@?|: \t]*")  # the letters of Hydra's unquoted texts
 _KEY_LETTERS = "/\\+$*@?| "  # those that a name in {name: value} may have besides letters, digits and _.-~
@@ -60,9 +59,11 @@ def quote_words(value: str) -> str:
     """Return a value with quotes around each text in it that has letters foreign to Hydra's grammar."""
     if _READABLE.fullmatch(value):
         return value
+
     choice = _CHOICE.fullmatch(value)
     if choice is not None and not value.isascii():  # Hydra takes the quotes off the values of this form
         value = choice[1]
+
     return "".join(_requoted(value))
 
 
@@ -98,16 +99,21 @@ def _text_options(schema: type) -> frozenset[str]:
 
 
 def _literal_line(line: str, schema: type, sweep: bool) -> str:
+    # surrogates stand for bytes of a file name that are no UTF-8
     try:
         line.encode()
     except UnicodeEncodeError as error:
         raise ConfigError(f"{line!r} has bytes that are no UTF-8 text; rename the file or folder") from error
+
     match = LINE.fullmatch(line)
     if match is None or match["rest"] is None or match["key"] not in _text_options(schema):
         return line
+
     text = match["rest"][1:]
     if _SIMPLE.fullmatch(text) and text.lower() not in _WORDS:
         return line
+
+    # what Hydra reads as null, a text or (in a sweep) several values keeps that meaning
     head = line[: len(line) - len(text)]
     override = parse_or_none(f"text={text}") if text.strip() else None
     if override is not None:
@@ -117,8 +123,11 @@ def _literal_line(line: str, schema: type, sweep: bool) -> str:
             return line
     elif not text.strip() or _QUOTED.fullmatch(text):
         return line
+
+    # several texts, some of which Hydra cannot read: each is quoted by itself
     if sweep and override is None and match["key"] not in ONE_FOLDER:
         return head + ",".join(_element(part) for part in text.split(","))
+
     return head + quoted(text)
 
 
@@ -130,26 +139,34 @@ def _element(text: str) -> str:
 def _requoted(value: str) -> Iterator[str]:
     """Yield the pieces of a value: separators as they are, each text between two of them to be read."""
     nesting, word, at = [""], "", 0
+    # whether the word being read is a name in {name: value}
     is_key = False
+
     while at < len(value):
+        # a quoted text is one piece, separators in it and all; quotes inside a word are letters of it
         match = None if word.strip() else _QUOTED.match(value, at)
         if match is not None:
             word += match[0]
             at = match.end()
             continue
+
         piece = _PIECE.match(value, at)[0]  # type: ignore[index]
         at += len(piece)
+
         ends_key = piece == ":" and is_key
         if not (piece in ("(", ")", "[", "]", "{", "}", ",") or ends_key):
             word += piece
             continue
+
         yield _word(word, nesting[-1], ends_key) + piece
         word = ""
         if piece in "([{":
             nesting.append(piece)
         elif piece in ")]}" and len(nesting) > 1:
             nesting.pop()
+
         is_key = nesting[-1] == "{" and piece in "{,"
+
     yield _word(word, nesting[-1], False)
 
 
@@ -157,7 +174,10 @@ def _word(word: str, within: str, is_key: bool) -> str:
     text = word.strip()
     if is_key:
         return key_spelling(text)
+
+    # left alone: what Hydra reads, what is quoted, and name=value of a call, range(start=1,stop=3)
     is_plain = _READABLE.fullmatch(re.sub(r"\$\{[^}]*\}", "", _ESCAPED.sub("", text)))
     if is_plain or text[0] in "\"'" or (within == "(" and re.match(r"\w+\s*=", text)):
         return word
+
     return quoted(_ESCAPED.sub(r"\1", text))

@@ -23,12 +23,16 @@ def folder_of(factory: str) -> Path | None:
     """Return the folder on Python's path in which the factory's module is found; None: in no folder."""
     add_working_directory()
     module = factory.partition(":")[0]
+
     try:
         spec = importlib.util.find_spec(module)
     except Exception:  # a parent package raises what it likes
         return None
+
     if spec is None or not spec.has_location or spec.origin is None:
         return None
+
+    # up by one for each parent package, and by one more for a package, whose file is its __init__.py
     file = Path(spec.origin).absolute()
     levels = module.count(".") + (file.stem == "__init__")
     return file.parents[levels] if levels < len(file.parents) else None
@@ -44,6 +48,8 @@ def look_in(folder: Path | None, factory: str, run: Path) -> None:
     module = factory.partition(":")[0]
     if _is_found(module):
         return
+
+    # last on the path, so that it hides no other module
     if folder is not None:
         sys.path.append(str(folder))
         if _is_found(module):
@@ -56,6 +62,7 @@ def look_in(folder: Path | None, factory: str, run: Path) -> None:
         elsewhere = f", nor in {folder}, where the run {run} found it"
     else:
         elsewhere = f", and the folder {folder}, where the run {run} found it, is gone"
+
     raise ConfigError(
         f"env.factory={factory}: there is no module {module!r} in the working directory {Path.cwd()} or "
         f"elsewhere on Python's path{elsewhere}; go to the folder that holds it, or name it in "
@@ -68,6 +75,7 @@ def _is_found(module: str) -> bool:
     try:
         return importlib.util.find_spec(module) is not None
     except ModuleNotFoundError as error:
+        # a parent package may miss an import of its own, which says nothing against the module
         return not (error.name and f"{module}.".startswith(f"{error.name}."))
     except Exception:
         return True
