@@ -108,7 +108,7 @@ def _to_tensors(value: Any) -> Any:
 
 
 def _array_to_tensor(array: np.ndarray) -> Any:
-    # Unsigned numbers go as signed ones, bytes unchanged, beside their type's name; `to_arrays` turns them back.
+    # Unsigned numbers go as signed ones of the same bytes, with their type; `to_arrays` turns them back.
     if array.dtype in (np.uint16, np.uint32, np.uint64):
         return {
             "__array__": str(array.dtype),
