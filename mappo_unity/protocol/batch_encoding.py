@@ -84,4 +84,5 @@ def joined_rows(number: int, parts: list[np.ndarray | list[bytes]], count: int) 
     for i in range(count):
         content = b"".join(part[i] if isinstance(part, list) else part[i].tobytes() for part in parts)
         rows.append(delimited(number, content))
+
     return b"".join(rows)

@@ -55,12 +55,14 @@ class UnityPlayer(BaseEnv):
         self, options: PlayerOptions, seed: int = 0, side_channels: list[SideChannel] | None = None
     ) -> None:
         self.options, self.seed = options, seed
+
         parameters, engine = EnvironmentParametersChannel(), EngineConfigurationChannel()
         engine.set_configuration_parameters(**options.engine)
         self._engine = engine
         for name, value in options.parameters.items():
             parameters.set_float_parameter(name, value)
         self._channels = SideChannelManager([parameters, engine, *(side_channels or [])])
+
         self._decoders: dict[str, BehaviorDecoder] = {}
         self._encoders: dict[str, ActionEncoder] = {}
         self._steps: dict[str, tuple[DecisionSteps, TerminalSteps]] = {}
@@ -71,6 +73,8 @@ class UnityPlayer(BaseEnv):
         """The player's UnityRLInitializationOutputProto, once connected."""
         self.process: PlayerProcess | None = None
         """The player's process; None for the Editor."""
+
+        # The player is started after this: its command line names the port that is listened on.
         self._link = Link(options.port)
         if options.executable is not None:
             try:
@@ -97,6 +101,7 @@ class UnityPlayer(BaseEnv):
                 self.options.timeout_s,
                 self._link.port,
             )
+
         output = self._receive()
         self.handshake = output.rl_initialization_output
         self._check_version()
@@ -107,6 +112,7 @@ class UnityPlayer(BaseEnv):
         """Hand the actions over and let the player go on; agents without an action act with zeros."""
         if not self._was_reset:
             return self.send_reset()
+
         actions = {}
         for name, (decision, _) in self._steps.items():
             if len(decision):
@@ -114,6 +120,7 @@ class UnityPlayer(BaseEnv):
                 if action is None:
                     action = self._decoders[name].spec.action_spec.empty_action(len(decision))
                 actions[name] = self._encoders[name].encode(action)
+
         self._send(actions, messages.STEP)
 
     def send_reset(self) -> None:
@@ -178,6 +185,7 @@ class UnityPlayer(BaseEnv):
         decision = self._steps[behavior_name][0]
         if agent_id not in decision.agent_id_to_index:
             raise IndexError(f"agent {agent_id} of {behavior_name} did not request a decision")
+
         row = decision.agent_id_to_index[agent_id]
         action = spec._validate_action(action, 1, behavior_name)
         stored = self._actions.setdefault(behavior_name, spec.empty_action(len(decision)))
@@ -206,10 +214,12 @@ class UnityPlayer(BaseEnv):
             data = self._link.receive(self.options.timeout_s, self._check_alive)
         except LinkTimeout as error:
             raise self._failure(self._silence()) from error
+
         try:
             answer = messages.parse(data)
         except DecodeError as error:
             raise self._failure(f"sent a malformed message of {len(data)} bytes ({error})") from error
+
         if answer.header.status != STATUS_OK:
             reason = answer.header.message
             raise self._failure("closed the connection" + (f": {reason}" if reason else ""))
@@ -246,6 +256,8 @@ class UnityPlayer(BaseEnv):
             name = brain.brain_name
             if name in self._decoders or name not in infos or not infos[name].value:
                 continue
+
+            # Which sensors there are only an agent's message says; hence the wait for one.
             spec = behavior_spec(brain, infos[name].value[0])
             self._decoders[name] = BehaviorDecoder(name, spec)
             self._encoders[name] = ActionEncoder(spec, old=not self.handshake.capabilities.hybridActions)
@@ -266,10 +278,12 @@ class UnityPlayer(BaseEnv):
             return
         self._open = False
         self._link.say_quit()
+
         if self.process is not None:
             if patience_s:
                 self.process.wait(patience_s)
             self.process.kill()
+
         self._link.close()
 
     def _name(self) -> str:

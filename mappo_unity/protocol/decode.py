@@ -44,6 +44,7 @@ class BehaviorDecoder:
         """
         asked = [info for info in infos if not info.done]
         ended = [info for info in infos if info.done] if len(asked) < len(infos) else []
+
         decision, terminal = self._empty
         if asked:
             mask = self._masks(asked) if self._allowed else None
@@ -53,6 +54,7 @@ class BehaviorDecoder:
             obs, reward, agents, groups, group_reward = self._columns(ended)
             interrupted = np.array([info.max_step_reached for info in ended], bool)
             terminal = TerminalSteps(obs, reward, interrupted, agents, groups, group_reward)
+
         return decision, terminal
 
     def _columns(
@@ -62,18 +64,22 @@ class BehaviorDecoder:
         if any(len(row) != len(self._widths) for row in rows):
             counts = sorted({len(row) for row in rows})
             raise MalformedMessage(f"{self.name} has {len(self._widths)} sensors, a message has {counts}")
+
         agents = np.array([info.id for info in infos], np.int32)
         obs = [self._sensor(i, [row[i] for row in rows], agents) for i in range(len(self._widths))]
         reward = np.array([info.reward for info in infos], np.float32)
         group_reward = np.array([info.group_reward for info in infos], np.float32)
+
         self._check_finite(reward, "reward", agents)
         self._check_finite(group_reward, "group reward", agents)
+
         return obs, reward, agents, np.array([info.group_id for info in infos], np.int32), group_reward
 
     def _sensor(self, index: int, observations: list[Any], agents: np.ndarray) -> np.ndarray:
         shape = self.spec.observation_specs[index].shape
         if observations[0].compression_type == PNG:
             return np.stack([self._picture(index, o) for o in observations])
+
         data = [o.float_data.data for o in observations]
         width = self._widths[index]
         if any(len(row) != width for row in data):
@@ -81,38 +87,48 @@ class BehaviorDecoder:
             raise MalformedMessage(
                 f"{self.name}: sensor obs_{index} has shape {tuple(shape)}, a message has {sizes} numbers"
             )
+
+        # A bytearray, so that the array over it can be written to.
         out = np.frombuffer(bytearray().join(data), "<f4").reshape(len(data), *shape)
         self._check_finite(out, f"sensor obs_{index}", agents)
+
         return out
 
     def _picture(self, index: int, observation: Any) -> np.ndarray:
         shape = tuple(self.spec.observation_specs[index].shape)
         image = _pixels(observation.compressed_data, list(observation.compressed_channel_mapping))
+
         if 1 in (shape[0], shape[2]) and image.shape[2] == 3:  # grey, sent as a colour picture
             image = image.mean(axis=2, keepdims=True)
+
         if shape[1:] == image.shape[:2]:  # channels first: ML-Agents 3 and later
             image = np.moveaxis(image[:, :, : shape[0]], 2, 0)
         else:
             image = image[:, :, : shape[2]]
+
         if image.shape != shape:
             raise MalformedMessage(
                 f"{self.name}: sensor obs_{index} has shape {shape}, its picture {image.shape}"
             )
+
         return image
 
     def _masks(self, infos: list[Any]) -> list[np.ndarray]:
         size = len(self._allowed)
+        # A mask says what is forbidden; an agent without one may do everything.
         masks = [info.action_mask or self._allowed for info in infos]
         if any(len(mask) != size for mask in masks):
             raise MalformedMessage(
                 f"{self.name} has {size} discrete actions, a mask {len(max(masks, key=len))}"
             )
+
         table = np.frombuffer(b"".join(masks), np.uint8).reshape(len(masks), size).astype(bool)
         return np.split(table, self._cuts, axis=1)
 
     def _check_finite(self, numbers: np.ndarray, what: str, agents: np.ndarray) -> None:
         with np.errstate(over="ignore", invalid="ignore"):
             fine = np.isfinite(numbers.sum())  # quick; the sum of huge numbers may overflow
+
         if not fine and not np.isfinite(numbers).all():
             row = int(np.argwhere(~np.isfinite(numbers))[0][0])
             bad = numbers[row][~np.isfinite(numbers[row])].flat[0] if numbers.ndim > 1 else numbers[row]
@@ -131,15 +147,19 @@ class ActionEncoder:
         self.old = old
         size, branches = spec.action_spec.continuous_size, spec.action_spec.discrete_size
         self._size, self._branches = size, branches
+
         row = Layout()
         floats = Layout()
+        # Before protocol 1.3 discrete actions went as floats, too.
         floats.slot("floats", 4 * (branches if old and not size else size))
         if floats.template:
             row.append(floats.delimited(1 if old else 6))
+
         if branches and not old:
             indices = Layout()
             indices.slot("indices", VARINT_BYTES * branches)
             row.append(indices.delimited(7))
+
         self._row = row.delimited(1)
 
     def encode(self, action: ActionTuple) -> bytes:
@@ -151,6 +171,7 @@ class ActionEncoder:
             columns["floats"] = float_columns(action.discrete)
         if self._branches and not self.old:
             columns["indices"] = packed_varints(action.discrete)
+
         return self._row.rows(len(next(iter(columns.values()))), columns).tobytes()
 
 
@@ -164,6 +185,8 @@ def behavior_spec(brain: Any, info: Any) -> BehaviorSpec:
 def initialization(seed: int, num_areas: int, package_version: str) -> bytes:
     """Return the UnityInputProto that answers a player's first message."""
     capabilities = b"".join(varint(i << 3) + b"\x01" for i in range(1, len(CAPABILITIES) + 1))
+
+    # Tags of single numbers: 0x08 is field 1, 0x28 is field 5.
     content = (
         b"\x08"
         + varint(seed)
@@ -173,11 +196,13 @@ def initialization(seed: int, num_areas: int, package_version: str) -> bytes:
         + b"\x28"
         + varint(num_areas)
     )
+
     return delimited(2, content)
 
 
 def rl_input(actions: Mapping[str, bytes], command: int, side_channel: bytes) -> bytes:
     """Return a UnityInputProto: actions of every behavior, a command, side-channel messages."""
+    # 0x20 is the tag of field 4, the command.
     content = b"".join(map_entry(1, name, rows) for name, rows in actions.items()) + b"\x20" + varint(command)
     if side_channel:
         content += delimited(5, side_channel)
@@ -195,6 +220,7 @@ def _pixels(data: bytes, mapping: list[int]) -> np.ndarray:
     from PIL import Image
 
     header, stream, planes, start = b"\x89PNG\r\n\x1a\n", OffsetBytesIO(data), [], 0
+    # Pillow seeks to 0 before it reads: the stream counts from where the next picture begins.
     try:
         while start >= 0:
             stream.offset = start
@@ -206,6 +232,7 @@ def _pixels(data: bytes, mapping: list[int]) -> np.ndarray:
         picture = np.concatenate(planes, axis=2)
     except (OSError, SyntaxError, ValueError, UnityException) as error:
         raise MalformedMessage(f"a picture of {len(data)} bytes cannot be decoded: {error}") from error
+
     if not mapping:
         return picture
     groups = [[p for p, to in enumerate(mapping) if to == channel] for channel in range(max(mapping) + 1)]

@@ -44,8 +44,11 @@ class BehaviorEncoder:
         self.name, self.spec = name, spec
         self.pictures = [png and is_picture(sensor) for sensor in spec.observation_specs]
         self.mask_size = sum(spec.action_spec.discrete_branches)
+
         self._head = _head_layout(self.mask_size)
         self._sensors = [_float_sensor(i, sensor) for i, sensor in enumerate(spec.observation_specs)]
+
+        # The row of an agent whose sensors all go as floats.
         whole = Layout()
         for part in (self._head, *self._sensors):
             whole.append(part)
@@ -62,7 +65,10 @@ class BehaviorEncoder:
         spec = b"\x08" + varint(int(actions.continuous_size)) + b"\x10" + varint(len(branches))
         if branches:
             spec += delimited(3, b"".join(varint(size) for size in branches))
+
+        # Trainers from before protocol 1.3 read the sizes from the old fields, 3 and 6.
         old_sizes = branches if branches else [int(actions.continuous_size)]
+
         return (
             delimited(3, b"".join(varint(size) for size in old_sizes))
             + (b"" if branches else b"\x30\x01")  # the deprecated kind of action: continuous
@@ -75,20 +81,26 @@ class BehaviorEncoder:
         count = len(steps)
         if not count:
             return b""
+
         columns = self._head_columns(steps, ends)
         drawn = {
             i: pictures
             for i, picture in enumerate(self.pictures)
             if picture and (pictures := _drawn(i, self.spec.observation_specs[i], steps.obs[i])) is not None
         }
+
+        # Floats only: all rows are equally long, and are written at once.
         if not drawn:
             for i, obs in enumerate(steps.obs):
                 columns[f"obs_{i}"] = float_columns(obs)
             return self._row.rows(count, columns).tobytes()
+
+        # PNGs differ in length: rows are joined one by one.
         parts: list[np.ndarray | list[bytes]] = [self._head.rows(count, columns)]
         for i, sensor in enumerate(self._sensors):
             floats = {f"obs_{i}": float_columns(steps.obs[i])}
             parts.append(drawn[i] if i in drawn else sensor.rows(count, floats))
+
         return joined_rows(1, parts, count)
 
     def _head_columns(self, steps: DecisionSteps | TerminalSteps, ends: bool) -> dict[str, np.ndarray]:
@@ -99,10 +111,12 @@ class BehaviorEncoder:
             "group_id": varint_columns(np.asarray(steps.group_id)),
             "group_reward": float_columns(steps.group_reward),
         }
+
         if isinstance(steps, TerminalSteps):
             columns["interrupted"] = steps.interrupted.astype(np.uint8)[:, None]
         elif self.mask_size and steps.action_mask is not None:
             columns["mask"] = np.concatenate(steps.action_mask, axis=1).astype(np.uint8)
+
         return columns
 
 
@@ -139,10 +153,12 @@ def decode_actions(spec: BehaviorSpec, values: Sequence[Any]) -> ActionTuple:
     size, branches = spec.action_spec.continuous_size, spec.action_spec.discrete_size
     count = len(values)
     old = bool(count) and not values[0].continuous_actions and not len(values[0].discrete_actions)
+
     action = ActionTuple()
     if size:
         rows = [v.vector_actions_deprecated if old else v.continuous_actions for v in values]
         action.add_continuous(_floats(rows, size))
+
     if branches:
         if old:
             discrete = _floats([v.vector_actions_deprecated for v in values], branches).astype(np.int32)
@@ -151,6 +167,7 @@ def decode_actions(spec: BehaviorSpec, values: Sequence[Any]) -> ActionTuple:
         if discrete.shape != (count, branches):
             raise ValueError(f"expected {branches} discrete actions for each of {count} agents")
         action.add_discrete(discrete)
+
     return action
 
 
@@ -163,6 +180,7 @@ def _floats(rows: list[bytes], size: int) -> np.ndarray:
 def _head_layout(mask_size: int) -> Layout:
     """Lay out AgentInfoProto up to its observations; the order of fields is free."""
     head = Layout()
+    # A tag is the field's number << 3 | its wire type.
     for tag, name, width in (
         (b"\x3d", "reward", 4),
         (b"\x40", "done", 1),
@@ -173,9 +191,11 @@ def _head_layout(mask_size: int) -> Layout:
     ):
         head.constant(tag)
         head.slot(name, width)
+
     if mask_size:
         head.constant(b"\x5a" + varint(mask_size))
         head.slot("mask", mask_size)
+
     return head
 
 
@@ -194,6 +214,7 @@ def _description(sensor: ObservationSpec) -> bytes:
 def _float_sensor(index: int, sensor: ObservationSpec) -> Layout:
     numbers = Layout()
     numbers.slot(f"obs_{index}", 4 * int(np.prod(sensor.shape)))
+
     content = Layout()
     content.constant(_description(sensor))
     content.append(numbers.delimited(1).delimited(4))
@@ -206,6 +227,7 @@ def _drawn(index: int, sensor: ObservationSpec, obs: np.ndarray) -> list[bytes] 
     exact = levels.astype(np.float32) / np.float32(255)
     if not (np.array_equal(exact, obs) and levels.min() >= 0 and levels.max() <= 255):
         return None
+
     head = _description(sensor) + b"\x10" + varint(PNG)
     return [delimited(13, head + delimited(3, _pngs(image))) for image in levels.astype(np.uint8)]
 
@@ -217,7 +239,9 @@ def _pngs(image: np.ndarray) -> bytes:
     """
     channels = image.shape[2]
     colours = np.repeat(image, 3, 2) if channels == 1 else np.pad(image, ((0, 0), (0, 0), (0, -channels % 3)))
+
     out = io.BytesIO()
     for first in range(0, colours.shape[2], 3):
         Image.fromarray(np.ascontiguousarray(colours[:, :, first : first + 3])).save(out, "PNG")
+
     return out.getvalue()

@@ -59,8 +59,10 @@ def message_class() -> Any:
     pool = descriptor_pool.DescriptorPool()
 
     def add(file: Any) -> None:
+        # A pool takes a file only after those that it imports.
         for needed in file.dependencies:
             add(needed)
+
         proto = descriptor_pb2.FileDescriptorProto()
         file.CopyToProto(proto)
         for message in proto.message_type:
@@ -77,6 +79,7 @@ def _declare_bytes(message: Any) -> None:
         if field.name in _AS_BYTES.get(message.name, ()):
             field.type, field.label = field.TYPE_BYTES, field.LABEL_OPTIONAL
             field.ClearField("options")  # [packed = ...] holds for arrays only
+
     for nested in message.nested_type:
         _declare_bytes(nested)
 
@@ -112,8 +115,10 @@ def message(
     """Return a UnityMessageProto with a header and, at most, one of the two sides' contents."""
     header = b"\x08" + varint(status) + (delimited(2, text.encode()) if text else b"")
     out = delimited(1, header)
+
     if unity_output is not None:
         out += delimited(2, unity_output)
     if unity_input is not None:
         out += delimited(3, unity_input)
+
     return out

@@ -59,6 +59,7 @@ class SeveralPlayers(BaseEnv):
         """Return the decision and terminal steps of the last results, player by player."""
         holders = self._holders(behavior_name)
         steps = [(p, self.players[p].get_steps(behavior_name)) for p in holders]
+
         return (
             self._decisions([(p, decision) for p, (decision, _) in steps]),
             self._terminals([(p, terminal) for p, (_, terminal) in steps]),
@@ -69,11 +70,13 @@ class SeveralPlayers(BaseEnv):
         start = 0
         for p in self._holders(behavior_name):
             count = len(self.players[p].get_steps(behavior_name)[0])
+
             part = ActionTuple()
             if action.continuous is not None:
                 part.add_continuous(action.continuous[start : start + count])
             if action.discrete is not None:
                 part.add_discrete(action.discrete[start : start + count])
+
             self.players[p].set_actions(behavior_name, part)
             start += count
 
@@ -97,6 +100,7 @@ class SeveralPlayers(BaseEnv):
             raise UnityActionException(
                 f"there is no behavior {name!r}; there are {list(self.behavior_specs)}"
             )
+
         return holders
 
     def _outward(self, ids: np.ndarray, player: int) -> np.ndarray:

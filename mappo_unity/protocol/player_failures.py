@@ -27,6 +27,7 @@ def never_connected(options: PlayerOptions, port: int) -> str:
             f"did not connect to port {port} {limit}: press Play in a scene whose agents have "
             "Behavior Type Default, and see that no other training run is on that port"
         )
+
     return (
         f"did not connect {limit}: it may need env.no_graphics=true on a machine without a display, wait "
         "for a user, or hold no agent with Behavior Type Default"

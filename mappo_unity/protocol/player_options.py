@@ -34,4 +34,5 @@ class PlayerOptions:
         arguments += ["--mlagents-port", str(port)]
         if self.own_log_file is None:
             arguments += ["-logFile", str(self.log_file)]
+
         return arguments + self.arguments

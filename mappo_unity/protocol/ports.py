@@ -20,6 +20,7 @@ FREE, LINGERS, TAKEN, FORBIDDEN = "free", "TIME_WAIT", "in use", "forbidden"
 
 def port_state(port: int) -> str:
     """Return "free", "TIME_WAIT", "in use" or "forbidden" for a port of the loopback address."""
+    # A port in TIME_WAIT can be had with SO_REUSEADDR only, one that is held not even so.
     for reuse, verdict in ((0, FREE), (1, LINGERS)):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, reuse)
@@ -31,6 +32,7 @@ def port_state(port: int) -> str:
                     return FORBIDDEN
             if os.name == "nt":  # there SO_REUSEADDR takes a port from who holds it
                 break
+
     return TAKEN
 
 
@@ -42,6 +44,7 @@ def check_port(port: int, option: str) -> None:
             f"port {port} of {ADDRESS} is in use: another training run, or a game started by hand, holds it; "
             f"end that one, or choose another port ({option}) on both sides"
         )
+
     if state == FORBIDDEN:
         raise ConfigError(
             f"port {port} of {ADDRESS} may not be listened on by this user: choose one from 1024 up "

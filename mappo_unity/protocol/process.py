@@ -54,8 +54,10 @@ def find_executable(file_name: str, option: str = "env.file_name") -> Path:
 
     if not file_name.strip():
         raise ConfigError(f"{option}= is empty: give the path of the built player")
+
     path = Path(os.path.expanduser(file_name))
     _check_link(path, f"{option}={file_name}")
+
     # ML-Agents takes the name for a pattern; where that finds nothing, its brackets are letters
     matched = validate_environment_path(str(path)) or validate_environment_path(glob.escape(str(path)))
     place = Path(matched or path)
@@ -65,14 +67,17 @@ def find_executable(file_name: str, option: str = "env.file_name") -> Path:
             f"{option}={file_name}: no Unity player is there; looked for {path.absolute()} with "
             f"{kinds}; give the path of the built player{_inside(path) or _beside(path)}"
         )
+
     found = place.absolute()
     if not os.access(found, os.X_OK):
         raise ConfigError(
             f"{option}={file_name}: {found} is not executable; run: chmod +x {shell_word(found)}"
         )
+
     reason = _why_not_run(found)
     if reason is not None:
         raise ConfigError(f"{option}={file_name}: {found} cannot be run on this system: {reason}")
+
     return found
 
 
@@ -96,21 +101,27 @@ def _why_not_run(path: Path) -> str | None:
     """Say why a file is no program for this system, as far as its beginning tells; None if it may be one."""
     if os.name == "nt":
         return None
+
     with path.open("rb") as file:
         begin = file.read(256)
     if not begin:
         return "it is empty; build or copy the player again"
+
     if begin.startswith(b"#!"):
+        # Only spaces and tabs go: a carriage return belongs to the name, as the kernel reads it.
         interpreter = begin[2:].split(b"\n")[0].decode(errors="replace").strip(" \t")
         if os.path.exists(interpreter.split(" ")[0]):
             return None
         return f"it is a script for {interpreter!r}, which is not there"
+
     for magic, system in _PROGRAMS.items():
         if begin.startswith(magic):
             home = {"Linux": "linux", "macOS": "darwin"}.get(system, "win32")
             return None if sys.platform == home else f"it is built for {system}; build one for this system"
+
     if b"\0" in begin:
         return None  # perhaps a format that was registered here
+
     return "it is a text without a first line such as #!/bin/sh; give the player itself"
 
 
@@ -122,9 +133,12 @@ class PlayerProcess:
 
     def __init__(self, executable: Path, arguments: list[str], output: Path) -> None:
         self.executable, self.output = executable, output
+
         command = [str(executable), *arguments]
+        # A small program asks the kernel to die with this process, then becomes the player.
         if sys.platform.startswith("linux"):
             command = [sys.executable, "-S", "-E", "-c", _DIE_WITH_PARENT, str(os.getpid()), *command]
+
         output.parent.mkdir(parents=True, exist_ok=True)
         self._process = _starter(os.getpid()).submit(_start, command, output).result()
 
@@ -140,6 +154,8 @@ class PlayerProcess:
             return None
         if code >= 0:
             return f"exit code {code}"
+
+        # subprocess gives a signal as its negative number.
         try:
             return f"killed by {signal.Signals(-code).name}"
         except ValueError:
@@ -149,6 +165,7 @@ class PlayerProcess:
         """Say what there is to read about this player: its log, else the end of what it printed."""
         if log_file.is_file() and log_file.stat().st_size > 0:
             return f"its log: {log_file}"
+
         end = _end_of(self.output)
         return (
             f"it wrote no log, but printed ({self.output}): {end}" if end else "it printed and logged nothing"
@@ -171,12 +188,15 @@ class PlayerProcess:
                 self._process.kill()
         except (ProcessLookupError, PermissionError):
             pass  # it has ended
+
+        # Takes its exit code, so that no zombie stays.
         self._process.wait()
 
 
 @cache
 def _starter(pid: int) -> ThreadPoolExecutor:
     """Return the one thread of this process that starts players."""
+    # Kept by pid: in a child that was forked the parent's thread does not run.
     return ThreadPoolExecutor(1, "player-starter")
 
 
@@ -195,9 +215,11 @@ def _end_of(path: Path) -> str:
     """Return the last lines of a file as one, without control characters; "" if there are none."""
     if not path.is_file():
         return ""
+
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - LAST_BYTES))
         text = file.read().decode(errors="replace")
+
     lines = ["".join(filter(str.isprintable, line)).strip()[:LINE_LENGTH] for line in text.splitlines()]
     return " | ".join([line for line in lines if line][-LAST_LINES:])
 
@@ -217,5 +239,6 @@ def _beside(path: Path) -> str:
         return f" (there is no folder {folder})"
     if not os.access(folder, os.R_OK | os.X_OK):
         return f" (the folder {folder} may not be read)"
+
     names = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
     return f" ({folder} holds {', '.join(names[:10]) or 'nothing'}{', ...' if len(names) > 10 else ''})"

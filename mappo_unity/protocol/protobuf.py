@@ -32,6 +32,7 @@ def install() -> None:
     """
     if not any(isinstance(finder, _OldPb2Finder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _OldPb2Finder())
+
     if importlib.util.find_spec("distutils") is None:  # Python 3.12+; mlagents_envs compares versions with it
         importlib.import_module("setuptools")  # brings its own distutils
 
@@ -65,12 +66,15 @@ class _OldPb2Finder(MetaPathFinder):
     ) -> ModuleSpec | None:
         if not (fullname.startswith(PREFIX) and fullname.endswith(SUFFIX)):
             return None
+
         spec = PathFinder.find_spec(fullname, path, target)
         if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
             return spec
+
         serialized = read_serialized_file(Path(spec.origin))
         if serialized is not None:
             spec.loader = _SerializedLoader(serialized)
+
         return spec
 
 
@@ -85,8 +89,10 @@ class _SerializedLoader(Loader):
         from google.protobuf.internal import builder
 
         names = vars(module)
+        # A pool takes a file only after those that it imports.
         for imported in descriptor_pb2.FileDescriptorProto.FromString(self.serialized).dependency:
             importlib.import_module(imported.removesuffix(".proto").replace("/", ".") + SUFFIX)
+
         names["DESCRIPTOR"] = descriptor_pool.Default().AddSerializedFile(self.serialized)
         builder.BuildMessageAndEnumDescriptors(names["DESCRIPTOR"], names)
         builder.BuildTopDescriptorsAndMessages(names["DESCRIPTOR"], module.__name__, names)

@@ -33,9 +33,11 @@ def fetch_player(registry: str, entry: str) -> Path:
         raise ConfigError(
             f"env.registry={registry} has no entry {entry!r}; choices: {choices} (env.registry_entry=...)"
         )
+
     url = getattr(entries[entry], _URLS.get(sys.platform, "_linux_url"))
     if url is None:
         raise ConfigError(f"entry {entry!r} of env.registry={registry} has no player for {sys.platform}")
+
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # its progress bars
             path = get_local_binary_path(entry, url)
@@ -44,6 +46,7 @@ def fetch_player(registry: str, entry: str) -> Path:
         raise ConfigError(
             f"entry {entry!r} of env.registry={registry}: {url} gives no player: {reason}"
         ) from error
+
     return find_executable(path, f"registry entry {entry}")
 
 
@@ -55,6 +58,7 @@ def _entries(registry: str) -> dict[str, Any]:
     else:
         source = UnityEnvRegistry()
         source.register_from_yaml(registry)
+
     try:
         return dict(source.items())
     except Exception as error:  # a missing file, no network, no YAML, other keys

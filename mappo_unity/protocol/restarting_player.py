@@ -48,10 +48,12 @@ class RestartingPlayer(BaseEnv):
         self.max_restarts = max_restarts
         self.restarts = 0
         self.crashed_agents: dict[str, np.ndarray] = {}
+
         self._failures_in_a_row = self._good_steps = 0
         self._last: dict[str, dict[int, DecisionSteps]] = {}  # newest decision of every agent that plays
         self._crashed_steps: dict[str, TerminalSteps] = {}
         self._specs = BehaviorMapping({})
+
         self.player: UnityPlayer = make_player(seed)
 
     def connect(self) -> None:
@@ -78,15 +80,19 @@ class RestartingPlayer(BaseEnv):
             EnvironmentFailure: the restarts are used up.
         """
         self.crashed_agents, self._crashed_steps = {}, {}
+
         try:
             self.player.receive()
         except PlayerFailure as failure:
             if not self._specs:
                 raise ConfigError(f"{self._name} cannot be started: {failure}") from failure
+
+            # Before the new player's agents take the places of those that were cut off.
             self._crashed_steps = self._end_crashed_episodes()
             self.crashed_agents = {name: steps.agent_id for name, steps in self._crashed_steps.items()}
             self._last.clear()
             self._start_another(failure)
+
         self._took_steps()
 
     # ---- BaseEnv ------------------------------------------------------------------------------------------
@@ -134,14 +140,19 @@ class RestartingPlayer(BaseEnv):
         self._good_steps += 1
         if self._good_steps >= STEADY_STEPS:
             self._failures_in_a_row = 0
+
         specs = self.player.behavior_specs
         if len(specs) > len(self._specs):
             self._specs = BehaviorMapping({**self._specs, **specs})
+
         for name in specs:
             decision, terminal = self.player.get_steps(name)
             playing = self._last.setdefault(name, {})
+
+            # The ended ones first: an id that is in both plays on.
             for agent in terminal.agent_id.tolist():
                 playing.pop(agent, None)
+
             if len(decision):
                 playing.update(dict.fromkeys(decision.agent_id.tolist(), decision))
 
@@ -156,15 +167,18 @@ class RestartingPlayer(BaseEnv):
                     f"{self._name} failed: {failure}. It was restarted {self.restarts} times, and "
                     f"env.max_restarts={self.max_restarts} allows no more"
                 ) from failure
+
             self.restarts += 1
             pause_s = _pause_s(self._failures_in_a_row)
             self._failures_in_a_row += 1
             self._good_steps = 0
+
             logger.warning(
                 "%s failed: %s; restart %d of at most %d%s",
                 *(self._name, failure, self.restarts, self.max_restarts),
                 f" in {pause_s:g} s" if pause_s else "",
             )
+
             time.sleep(pause_s)
             try:
                 self.player = self._make_player((self._seed + SEED_STRIDE * self.restarts) % 2**31)
@@ -173,6 +187,7 @@ class RestartingPlayer(BaseEnv):
             except PlayerFailure as error:
                 failure = error
                 continue
+
             return self._check_same(self.player.behavior_specs)
 
     def _check_same(self, specs: BehaviorMapping) -> None:
@@ -195,6 +210,7 @@ def _interrupted(playing: Mapping[int, DecisionSteps]) -> TerminalSteps:
     rows = [(steps, steps.agent_id_to_index[agent]) for agent, steps in playing.items()]
     sensors = range(len(rows[0][0].obs))
     zeros = np.zeros(len(rows), np.float32)
+
     return TerminalSteps(
         obs=[np.stack([steps.obs[i][row] for steps, row in rows]) for i in sensors],
         reward=zeros,

@@ -52,6 +52,7 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
     fixed: dict[str, Any] = dict(params or {}) | ({} if num_areas is None else {"num_areas": num_areas})
     if "seed" in fixed:
         raise ConfigError("--param seed: the seed is the trainer's to choose")
+
     if re.fullmatch(r"[\w.]+:\w+", scene):
         from mappo_unity.scenes.factory import call_factory, check_call, load_factory
 
@@ -67,6 +68,7 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
             f"there is no scene {scene!r}{hint}; choices: {choices}, or package.module:function"
         )
     make_scene(scene, **{"num_areas": 1} | fixed).close()  # refuses what it does not take
+
     return lambda seed, areas: make_scene(
         scene, seed=seed, **({} if areas is None else {"num_areas": areas}) | fixed
     )
@@ -78,6 +80,7 @@ def serve(player: Player, port: int, log: Log) -> int:
     if not _connect(channel, player.scene, port, log):
         channel.close()
         return 1
+
     try:
         return play(player, channel.unary_unary(messages.METHOD), log)
     finally:
@@ -87,6 +90,7 @@ def serve(player: Player, port: int, log: Log) -> int:
 def _connect(channel: grpc.Channel, scene: str, port: int, log: Log) -> bool:
     """Wait for the trainer, and say so if that takes a while; tell whether it came."""
     ready = grpc.channel_ready_future(channel)
+
     try:
         ready.result(timeout=QUIET_S)
         return True
@@ -95,6 +99,7 @@ def _connect(channel: grpc.Channel, scene: str, port: int, log: Log) -> bool:
             f"waiting up to {CONNECT_TIMEOUT_S:g} s for a trainer on port {port} of this machine "
             f"(localhost); start one in another terminal, for example: {_trainer(scene, port)}"
         )
+
     try:
         ready.result(timeout=CONNECT_TIMEOUT_S - QUIET_S)
         return True
@@ -162,8 +167,12 @@ class Player:
         )
         if answer.header.status != STATUS_OK:
             return
+
         self._open(answer.unity_input.rl_initialization_input)
+
+        # An empty message: the trainer answers it with its first command.
         answer = messages.parse(exchange(messages.message(STATUS_OK)))
+
         try:
             while answer.header.status == STATUS_OK and answer.HasField("unity_input"):
                 output = self.advance(answer.unity_input.rl_input)
@@ -175,21 +184,26 @@ class Player:
         """Apply a trainer's input to the environment; return the UnityOutputProto of its next steps."""
         if rl_input.side_channel:
             self._read_side_channels(rl_input.side_channel)
+
         if rl_input.command == messages.RESET:
             self.env.reset()
         else:
             for name, rows in rl_input.agent_actions.items():
                 self._act(name, rows.value)
             self.env.step()
+
         return self._output()
 
     def _open(self, parameters: Any) -> None:
         version = parameters.communication_version
         if version.split(".")[0] != messages.API_VERSION.split(".")[0]:
             raise PlayerError(f"the trainer speaks protocol {version!r}, this player {messages.API_VERSION}")
+
         # One area is what clients send when nobody chose: then the scene has as many as in Unity.
         areas = parameters.num_areas if parameters.num_areas > 1 else None
+        # The trainer's seed may be negative, numpy's may not.
         self.env = self.make_env(parameters.seed & 0x7FFFFFFF, areas)
+
         self.log(
             f"connected to mlagents_envs {parameters.package_version}, protocol {version}; "
             f"seed {parameters.seed}, areas {areas or 'as in Unity'}"
@@ -198,25 +212,32 @@ class Player:
     def _act(self, name: str, values: Sequence[Any]) -> None:
         if name not in self.encoders:
             raise PlayerError(f"actions for behavior {name!r}, which no agent has shown")
+
         asked = len(self.env.get_steps(name)[0])
         if len(values) != asked:
             raise PlayerError(
                 f"{len(values)} actions for {asked} agents of {name!r} that requested a decision"
             )
+
         if asked:
             self.env.set_actions(name, encode.decode_actions(self.encoders[name].spec, values))
 
     def _output(self) -> bytes:
         agent_infos, came_up = {}, []
+
         specs = self.env.behavior_specs
         for name in specs:
             decision, terminal = self.env.get_steps(name)
             if not len(decision) and not len(terminal):
                 continue
+
+            # A trainer learns of a behavior only together with its first agents.
             if name not in self.encoders:
                 self.encoders[name] = encode.BehaviorEncoder(name, specs[name], self.png)
                 came_up.append(self.encoders[name].brain_parameters())
+
             agent_infos[name] = self.encoders[name].encode(decision, terminal)
+
         hello = encode.initialization(self.scene, __version__, came_up) if came_up else None
         return encode.output(agent_infos, hello)
 

@@ -43,9 +43,13 @@ class Link:
         self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._peer: str | None = None
         self._closing = False
+        # One thread for the player's call, one to turn away whoever else calls.
         self._threads = _DaemonThreads(2)
+
+        # gRPC shares a port with others if it may; then a port in use would go unnoticed.
         self._server = grpc.server(self._threads, options=(("grpc.so_reuseport", 0), *OPTIONS))
         self._server.add_generic_rpc_handlers((_Handler(self._exchange),))
+
         try:
             self.port = self._server.add_insecure_port(f"{ADDRESS}:{port}")
         except RuntimeError as error:
@@ -63,6 +67,7 @@ class Link:
             LinkTimeout: nothing came.
         """
         deadline = time.monotonic() + timeout_s
+
         while True:
             left = deadline - time.monotonic()
             try:
@@ -95,8 +100,10 @@ class Link:
             self._peer = peer
         elif peer != self._peer:
             context.abort(grpc.StatusCode.FAILED_PRECONDITION, "this trainer has a player already")
+
         if self._closing:
             return message(STATUS_QUIT)
+
         self._requests.put(request)
         return self._answers.get()
 

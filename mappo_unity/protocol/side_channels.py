@@ -30,12 +30,15 @@ def split(data: bytes) -> Iterator[tuple[uuid.UUID, IncomingMessage]]:
     while at < len(data):
         if len(data) < at + 20:
             raise ValueError(f"{len(data) - at} bytes are left, a side-channel message has at least 20")
+
+        # A .NET Guid, the length as an int32, the content.
         channel = uuid.UUID(bytes_le=data[at : at + 16])
         (size,) = struct.unpack_from("<i", data, at + 16)
         if size < 0 or len(data) < at + 20 + size:
             raise ValueError(
                 f"a message of channel {channel} claims {size} bytes, {len(data) - at - 20} left"
             )
+
         yield channel, IncomingMessage(data[at + 20 : at + 20 + size])
         at += 20 + size
 
@@ -45,12 +48,17 @@ def read_parameter(message: IncomingMessage) -> tuple[str, float]:
     name = message.read_string()
     if message.read_int32() == 0:
         return name, message.read_float32()
+
+    # A sampler: its seed, its kind, its numbers.
     rng = np.random.default_rng(message.read_int32() & 0x7FFFFFFF)
+
     kind = message.read_int32()
     if kind == 0:
         return name, float(rng.uniform(message.read_float32(), message.read_float32()))
     if kind == 1:
         return name, float(rng.normal(message.read_float32(), message.read_float32()))
+
+    # Several intervals: the wider one is, the likelier.
     ends = np.array(message.read_float32_list()).reshape(-1, 2)
     widths = ends[:, 1] - ends[:, 0]
     low, high = ends[rng.choice(len(ends), p=widths / widths.sum())]
@@ -62,5 +70,6 @@ def read_engine_setting(message: IncomingMessage) -> str:
     kind = message.read_int32()
     values: dict[int, Any] = {0: lambda: f"{message.read_int32()} x {message.read_int32()}"}
     value = values.get(kind, message.read_float32 if kind == 2 else message.read_int32)()
+
     name = _ENGINE_SETTINGS[kind] if kind < len(_ENGINE_SETTINGS) else f"setting {kind}"
     return f"{name} {value}"

@@ -13,6 +13,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     """
     # Hidden, and no suffix of the target's: nobody who looks for such files may take it for one.
     temporary = path.with_name(f".{path.stem[:40]}.{os.getpid()}.part")
+
     try:
         with temporary.open("wb") as file:
             file.write(data)

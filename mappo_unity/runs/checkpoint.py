@@ -60,8 +60,11 @@ def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, be
             f"the run folder {folder} was removed or moved while the run was training: "
             f"no checkpoint of {agent_steps} steps can be written"
         )
+
     path = folder / FOLDER / NAME.format(agent_steps)
     save(path, state)
+
+    # A second name for the same file, moved into place: at no moment there is none.
     if best:
         link = path.with_name(f".{BEST}.{os.getpid()}.tmp")
         link.unlink(missing_ok=True)
@@ -71,8 +74,10 @@ def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, be
             save(path.with_name(BEST), state)
         else:
             os.replace(link, path.with_name(BEST))
+
     for old in checkpoints_in(folder)[:-keep]:
         old.unlink(missing_ok=True)
+
     return path
 
 
@@ -103,11 +108,13 @@ def _to_tensors(value: Any) -> Any:
 
 
 def _array_to_tensor(array: np.ndarray) -> Any:
+    # Unsigned numbers go as signed ones of the same bytes, with their type; `to_arrays` turns them back.
     if array.dtype in (np.uint16, np.uint32, np.uint64):
         return {
             "__array__": str(array.dtype),
             "data": torch.from_numpy(array.view(f"i{array.itemsize}").copy()),
         }
+
     return torch.from_numpy(np.ascontiguousarray(array).copy())
 
 
@@ -123,10 +130,12 @@ def to_arrays(value: Any) -> Any:
 
 
 def _sync_folder(folder: Path) -> None:
+    # A rename outlives a loss of power only once the folder is on the disk.
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError:  # not possible on every platform; the rename itself is atomic
         return
+
     try:
         os.fsync(descriptor)
     finally:

@@ -40,6 +40,7 @@ def read_plain(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise CheckpointError(f"checkpoint {path} does not exist")
+
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
@@ -54,8 +55,10 @@ def read_plain(path: Path) -> dict[str, Any]:
         raise
     except Exception as error:  # zipfile and pickle raise many kinds for damaged or hostile files
         raise CheckpointError(unreadable(path, error)) from error
+
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise CheckpointError(_other_format(path, state))
+
     return state
 
 
@@ -77,13 +80,16 @@ def newest_good(where: Path) -> tuple[Path, list[str]]:
     """
     if where.is_file():
         candidates, folder = [where], where.parent.parent
+        # A damaged file gives way to one before it, never to a later one.
         candidates += [p for p in reversed(checkpoints_in(folder)) if p.name < where.name]
     elif where.is_dir():
         candidates = list(reversed(checkpoints_in(where)))
     else:
         raise CheckpointError(f"{where} does not exist: give a run folder or a checkpoint file")
+
     if not candidates:
         raise CheckpointError(f"{where} holds no checkpoint ({FOLDER}/step_*.pt): nothing to resume from")
+
     warnings: list[str] = []
     for path in candidates:
         try:
@@ -92,6 +98,7 @@ def newest_good(where: Path) -> tuple[Path, list[str]]:
             warnings.append(str(error))
         else:
             return path, warnings
+
     raise CheckpointError(f"{where} holds no good checkpoint:\n  " + "\n  ".join(warnings))
 
 

@@ -52,13 +52,16 @@ def create_folder(wanted: Path, exact: bool = False) -> NewFolder:
     Raises ConfigError where it cannot be made or written.
     """
     parents = [parent for parent in reversed(wanted.parents) if not parent.exists()]
+
     try:
         wanted.parent.mkdir(parents=True, exist_ok=True)
         folder = NewFolder(_claim(wanted, exact), tuple(parents))
+        # A folder that was there may refuse files.
         probe = folder.path / ".probe"
         probe.touch()
         probe.unlink()
     except OSError as error:
+        # Leave nothing behind; a parent that others use by now is not empty and stays.
         for parent in reversed(parents):
             with suppress(OSError):
                 parent.rmdir()
@@ -67,6 +70,7 @@ def create_folder(wanted: Path, exact: bool = False) -> NewFolder:
             f"the output folder {wanted} cannot be made or written ({reason}: {error.filename}); "
             "output_dir=FOLDER sets another place"
         ) from error
+
     return folder
 
 
@@ -78,6 +82,7 @@ def discard_folder(folder: NewFolder, reason: BaseException | None = None) -> No
     named = (folder.path / PLAYERS).is_dir() and str(folder.path / PLAYERS) in str(reason)
     if named or _other_files(folder.path):
         return
+
     shutil.rmtree(folder.path, ignore_errors=True)  # it may be gone already
     for parent in reversed(folder.made):
         with suppress(OSError):
@@ -96,6 +101,8 @@ def write_record(folder: Path, config: Config, lines: list[str]) -> None:
     if config.env.factory is not None:
         versions[FACTORY_FOLDER] = str(folder_of(config.env.factory) or "") or None
     history.append({"date": datetime.now().astimezone().isoformat(timespec="seconds"), "overrides": lines})
+
+    # config.yaml last: a folder that has one counts as a run (`find_run`).
     try:
         write_atomically(folder / OVERRIDES, OmegaConf.to_yaml(OmegaConf.create(history)).encode())
         write_atomically(folder / VERSIONS, (json.dumps(versions, indent=2) + "\n").encode())
@@ -122,6 +129,7 @@ def restore_record(folder: Path, record: Record) -> None:
     """Put the record back, unless a checkpoint was written: then what it was trained with stays written."""
     if _state_of(folder.rglob("*.pt")) != record.checkpoints:
         return
+
     for name in RECORD:
         if name in record.files:
             write_atomically(folder / name, record.files[name])
@@ -135,12 +143,15 @@ def find_run(path: Path, option: str) -> Path:
     Raises ConfigError, naming the option, where there is none.
     """
     check_there(path, option)
+
     whole = Path(os.path.abspath(path))  # the path may be given from inside a run's folder
     levels = 1 if path.is_dir() else 3  # of a run's folder only that of its checkpoints is as good as itself
     above = [*path.parents][:levels] + [*whole.parents][:levels]
+
     for folder in [path, *above]:
         if (folder / CONFIG).is_file():
             return folder
+
     if path.is_file():
         raise ConfigError(
             f"{option}={path} lies in no run folder: there is no {CONFIG} beside it or above, which says how "
@@ -156,10 +167,13 @@ def runs_below(folder: Path, count: int = 5) -> str:
     """Return "; newest runs below ..." with the newest runs in a folder, or an empty text."""
     if not folder.is_dir() or folder.resolve() == folder.resolve().parent:  # nobody keeps runs in /
         return ""
+
     found: list[Path] = []
     with suppress(OSError):  # a folder that may not be read, or goes while it is
         for pattern in ("*", "*/*", "*/*/*", "*/*/*/*"):
             found += [path.parent for path in folder.glob(f"{pattern}/{CONFIG}")]
+
+    # Other programs have a config.yaml, too.
     found = [path for path in found if (path / VERSIONS).is_file()]
     newest = sorted(found, key=lambda path: (path / CONFIG).stat().st_mtime, reverse=True)[:count]
     return f"; newest runs below {folder}: {', '.join(map(str, newest))}" if newest else ""
@@ -177,11 +191,13 @@ def check_there(path: Path, option: str, wanted: str = "") -> None:
             raise ConfigError(
                 f"{option}={path} is a symbolic link to {os.readlink(path)}, which does not exist"
             ) from error
+
         near = path.parent
         while not near.exists():
             near = near.parent
         if Path.cwd() != near.resolve() and Path.cwd().is_relative_to(near.resolve()):
             near = Path()  # not half the disk
+
         raise ConfigError(f"{option}={path} does not exist{wanted}{runs_below(near)}") from error
     except OSError as error:
         circle = "it is a symbolic link that leads in a circle"
@@ -201,15 +217,19 @@ def factory_folder(folder: Path) -> Path | None:
 def read_versions() -> dict[str, Any]:
     """Return the versions of Python, of this package and its commit, and of what it stands on."""
     versions: dict[str, Any] = {"python": platform.python_version(), "platform": platform.platform()}
+
     for package in ("mappo-unity", *_PACKAGES):
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             versions[package] = None
+
+    # A checkout that is used without being installed.
     if versions["mappo-unity"] is None:
         from mappo_unity import __version__
 
         versions["mappo-unity"] = __version__
+
     return {**versions, **_git_state(Path(__file__).resolve().parents[2])}
 
 
@@ -222,6 +242,8 @@ def _claim(wanted: Path, exact: bool) -> Path:
                 f"name another one, or resume the run in it with {shell_argument('resume', wanted)}"
             )
         return wanted
+
+    # Making it is the claim: of runs that start at once one gets the name.
     for count in range(10_000):
         path = wanted.with_name(f"{wanted.name}_{count}") if count else wanted
         try:
@@ -229,16 +251,19 @@ def _claim(wanted: Path, exact: bool) -> Path:
             return path
         except FileExistsError:
             continue
+
     raise ConfigError(f"the output folder {wanted} and 10,000 names like it are taken")
 
 
 def _history(path: Path) -> list[Any]:
     if not path.is_file():
         return []
+
     try:
         history = OmegaConf.to_container(OmegaConf.load(path))
     except Exception as error:
         raise ConfigError(f"{path} cannot be read ({error})") from error
+
     return history if isinstance(history, list) else []
 
 

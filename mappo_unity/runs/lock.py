@@ -30,6 +30,7 @@ def locked(folder: Path) -> Iterator[str | None]:
     except OSError as error:
         yield _no_lock(folder, error)
         return
+
     with file:  # closing it gives the lock back
         yield _take(folder, file)
 
@@ -44,6 +45,7 @@ def _take(folder: Path, file: BinaryIO) -> str | None:
         ) from error
     except OSError as error:
         return _no_lock(folder, error)
+
     _sign(file)
     return None
 

@@ -67,6 +67,7 @@ class RunLog:
         check_loggers(cfg)
         metrics = folder / "metrics.csv"
         self._console = console or Console()
+
         if resume_steps is not None:
             for note in keep_until(folder, resume_steps):
                 self.message(note)
@@ -75,12 +76,16 @@ class RunLog:
                 f"{metrics} exists already; resume that run ({shell_argument('resume', folder)}) or take "
                 "another folder"
             )
+
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._progress = Progress(self._console, max_steps) if cfg.progress else None
         self._metrics = MetricsFile(metrics)
+
         self._excepthook = threading.excepthook
         threading.excepthook = self._on_thread_error
+
+        # After `keep_until`: they append to the files that it trims.
         self._loggers = [_make_logger(backend, cfg, folder) for backend in dict.fromkeys(cfg.loggers)]
 
     def log(self, row: Mapping[str, Any]) -> None:
@@ -90,19 +95,24 @@ class RunLog:
         Raises ConfigError where it cannot be written.
         """
         numbers_by_name = {name: _plain(value) for name, value in row.items()}
+
         try:
             self._write(numbers_by_name)
         except OSError as error:
             raise ConfigError(self._explain(error)) from error
+
         if self._progress is not None:
             self._progress.update(numbers_by_name)
 
     def _write(self, row: Mapping[str, int | float]) -> None:
         if not self._folder.is_dir():  # an open file could be written to all the same, and is lost
             raise FileNotFoundError(self._folder)
+
         self._metrics.append(row)
+
         step = int(row[STEP])
         curves = {name: x for name, x in row.items() if name != STEP and not math.isnan(x)}
+
         for logger in self._loggers:
             logger.log_metrics(curves, step=step)
             logger.flush()
@@ -112,6 +122,7 @@ class RunLog:
             return (
                 f"the run folder {self._folder} was removed or moved while the run was training: it ends here"
             )
+
         what = f"the metrics in {self._folder} cannot be written ({error.strerror or error})"
         if not any((self._folder / "checkpoints").glob("*.pt")):
             return f"{what}, and there is no checkpoint yet to resume from: free some space and start again"
@@ -134,11 +145,14 @@ class RunLog:
         if self._progress is not None:
             self._progress.close()
             self._progress = None
+
         with suppress(OSError):  # every row has been flushed; what a full disk refused has been said
             self._metrics.close()
+
         while self._loggers:
             with suppress(OSError):
                 _close_logger(self._loggers.pop())
+
         threading.excepthook = self._excepthook
 
     def _on_thread_error(self, args: threading.ExceptHookArgs) -> None:
@@ -164,6 +178,7 @@ def _make_logger(backend: LoggerKind, cfg: LogConfig, folder: Path) -> Logger:
     from torchrl.record import loggers
 
     name = "/".join(folder.resolve().parts[-2:])
+
     if backend is LoggerKind.csv:
         return loggers.CSVLogger("csv", log_dir=str(folder))
     if backend is LoggerKind.tensorboard:
@@ -172,6 +187,7 @@ def _make_logger(backend: LoggerKind, cfg: LogConfig, folder: Path) -> Logger:
         return loggers.WandbLogger(
             name, save_dir=str(folder), id=_wandb_id(folder / "wandb_id"), project=cfg.project
         )
+
     uri = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{folder.resolve() / 'mlflow.db'}"
     return loggers.MLFlowLogger(cfg.project, tracking_uri=uri, tags={"run": name})
 
@@ -190,4 +206,5 @@ def _close_logger(logger: Logger) -> None:
         import mlflow
 
         mlflow.end_run()
+
     logger.close()

@@ -40,6 +40,7 @@ class MetricsFile:
         new = [name for name in row if name not in self._columns]
         if new:
             self._add_columns(new)
+
         # One write of one line: a kill leaves a cut last line at most.
         self._file.write(_format([[str(row.get(name, "")) for name in self._columns]]))
         self._file.flush()
@@ -52,6 +53,8 @@ class MetricsFile:
         _, rows = _read_table(self.path)
         self._columns = [*self._columns, *names]
         padding = [""] * len(names)
+
+        # Closed first, opened again after: the file behind the name is another one then.
         self._file.close()
         write_atomically(self.path, _format([self._columns, *(row + padding for row in rows)]).encode())
         self._file = self.path.open("a", newline="", encoding="utf-8")
@@ -65,6 +68,7 @@ def read_metrics(path: Path) -> list[dict[str, int | float]]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist, or is not a file")
+
     columns, rows = _read_table(path)
     return [
         {name: _number(cell, path, line) for name, cell in zip(columns, row, strict=True) if cell}
@@ -84,13 +88,16 @@ def keep_until(folder: Path, agent_steps: int) -> list[str]:
         _keep_events(path, agent_steps)
     for path in sorted((folder / "csv" / "scalars").rglob("*.csv")):
         notes.append(_keep_scalars(path, agent_steps))
+
     return [note for note in notes if note is not None]
 
 
 def _keep_rows(path: Path, agent_steps: int) -> str | None:
     if not path.exists():
         return None
+
     columns, *rows = [_cells(line) for line in _whole_lines(path)] or [[]]
+
     kept, damaged = [columns], []
     for line, row in enumerate(rows, start=2):
         step = _step_of(row, columns)
@@ -98,10 +105,14 @@ def _keep_rows(path: Path, agent_steps: int) -> str | None:
             damaged.append(line)
         elif step <= agent_steps:
             kept.append(row)
+
     if columns and STEP not in columns:  # nobody can say what the rows hold
         kept, damaged = [[]], [1, *damaged]
+
+    # The copy first: the file is replaced next.
     note = _set_aside(path, damaged)
     _rewrite(path, _format(kept).encode() if kept[0] else b"")
+
     return note
 
 
@@ -110,8 +121,10 @@ def _keep_scalars(path: Path, agent_steps: int) -> str | None:
     rows = [_cells(line) for line in _whole_lines(path)]
     steps = [_step_of(row, [STEP, "value"]) for row in rows]
     note = _set_aside(path, [line for line, step in enumerate(steps, start=1) if step is None])
+
     lines = zip(path.read_bytes().split(b"\n"), steps, strict=False)  # without the cut last one
     kept = [line + b"\n" for line, step in lines if step is not None and step <= agent_steps]
+
     _rewrite(path, b"".join(kept))
     return note
 
@@ -137,9 +150,11 @@ def _set_aside(path: Path, damaged: Sequence[int]) -> str | None:
     """Copy a file that has damaged lines beside itself, and say so."""
     if not damaged:
         return None
+
     names = (f"{path.name}.damaged{number or ''}" for number in itertools.count())
     copy = next(place for place in (path.with_name(name) for name in names) if not place.exists())
     write_atomically(copy, path.read_bytes())
+
     lines = f"{len(damaged)} damaged line{'s' if len(damaged) > 1 else ''} (line {damaged[0]}"
     lines += f" to {damaged[-1]})" if len(damaged) > 1 else ")"
     return f"{path}: {lines} left out; the file as it was: {copy}"
@@ -164,10 +179,12 @@ def _split_records(data: bytes) -> Iterator[tuple[int, bytes]]:
         end = first + length + _FOOTER_BYTES
         if crc != masked_crc32c(data[start : start + _LENGTH_BYTES]) or end > len(data):
             return
+
         try:
             step = Event.FromString(data[first : first + length]).step
         except DecodeError:
             return
+
         yield step, data[start:end]
         start = end
 
@@ -182,9 +199,11 @@ def _read_table(path: Path) -> tuple[list[str], list[list[str]]]:
     table = list(csv.reader(_whole_lines(path))) if path.exists() else []
     if not table:
         return [], []
+
     for line, row in enumerate(table[1:], start=2):
         if len(row) != len(table[0]):
             raise ValueError(f"{path}, line {line}: {len(row)} cells, the header has {len(table[0])}")
+
     return table[0], table[1:]
 
 

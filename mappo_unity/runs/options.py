@@ -24,27 +24,33 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
     What says which run it is (env, env.name, the folders) cannot be overridden.
     """
     saved = load_config(base)
+
     chosen = last_value(lines, "env")
     if chosen is not None and chosen != saved.env.name:
         raise ConfigError(
             f"env={chosen} differs from the run's env={saved.env.name}: a run goes on in its own env; "
             "leave env out, or start a new run without resume"
         )
+
     rest = [line for line in lines if parse([line])[0].key_or_group != "env"]
     for key in ("env.name", "output_dir", "hydra.run.dir"):
         if last_value(rest, key) is not None:
             raise ConfigError(
                 f"{key} cannot change with resume: the run goes on in its own folder {base.parent}"
             )
+
     config = compose_config(rest, base).config
+    # The values are compared: the same seed given again is no change.
     if config.seed != saved.seed:
         raise ConfigError(
             f"seed={config.seed} cannot change with resume: the run has seed={saved.seed}, and its random "
             "numbers go on where they were; leave seed out, or start a new run without resume"
         )
+
     check_effect(rest, [config])
     if config.env.factory is not None:
         look_in(factory_folder(base.parent), config.env.factory, base.parent)
+
     return config
 
 
@@ -56,6 +62,7 @@ def config_to_play(run: Path, env: str | None) -> Config:
     """
     if env is not None:
         return compose_config([f"env={quoted(env)}"]).config
+
     try:
         folder = find_run(run, "run")
         config = load_config(folder / CONFIG)
@@ -64,6 +71,7 @@ def config_to_play(run: Path, env: str | None) -> Config:
             raise
         choices = ", ".join(group_choices()["env"])
         raise ConfigError(f"{error}; or say in which environment to play it: env=NAME ({choices})") from error
+
     if config.env.factory is not None:
         look_in(factory_folder(folder), config.env.factory, folder)
     return config

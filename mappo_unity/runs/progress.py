@@ -65,9 +65,12 @@ class Progress:
         """Show the newest row."""
         now = self._clock()
         self._marks.append((now, int(row["agent_steps"])))
+        # Two marks stay at least: a speed needs both ends.
         while now - self._marks[0][0] > RATE_WINDOW_S and len(self._marks) > 2:
             self._marks.popleft()
+
         line = self._job.mark + describe(row, self._max_steps, self._rate(row))
+
         if self._has_terminal():
             self._update_live(line)
         else:
@@ -80,6 +83,7 @@ class Progress:
         if self._live is not None:
             self._live.stop()
             self._live = None
+
         if self._unprinted is not None:
             self._print_plain()
 
@@ -114,6 +118,7 @@ def describe(row: Mapping[str, int | float], max_steps: int, steps_per_s: float)
     """
     steps = int(row["agent_steps"])
     left_s = max(max_steps - steps, 0) / steps_per_s if steps_per_s > 0 else math.nan
+
     return "  ".join(
         (
             f"{steps:,}/{max_steps:,} steps",

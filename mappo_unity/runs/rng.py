@@ -12,6 +12,7 @@ import torch
 def seed_everything(seed: int) -> None:
     """Seed torch's, numpy's and Python's global generators."""
     random.seed(seed)
+    # numpy takes 32 bits of seed at most.
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
 
@@ -20,6 +21,7 @@ def get_rng_state() -> dict[str, Any]:
     """Return the states of torch's, numpy's and Python's global generators."""
     kind, keys_, position, has_gauss, cached = np.random.get_state()
     version, internal, gauss_next = random.getstate()
+
     return {
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
@@ -39,7 +41,9 @@ def set_rng_state(state: dict[str, Any]) -> None:
     torch.set_rng_state(state["torch"])
     if state["cuda"] and torch.cuda.is_available():
         torch.cuda.set_rng_state_all(state["cuda"])
+
     kind, keys_, position, has_gauss, cached = state["numpy"]
     np.random.set_state((kind, np.asarray(keys_).astype(np.uint32), position, has_gauss, cached))
+
     version, internal, gauss_next = state["python"]
     random.setstate((version, tuple(internal), gauss_next))
