@@ -102,7 +102,6 @@ class ActorPolicy:
 
         # Back to the rows of `steps`: the network gives whole teams, with their empty places.
         chosen = out.cpu().numpy()[places.teams, places.members]
-
         size, action = spec.action_spec.continuous_size, ActionTuple()
         if size:
             scaled = np.clip(chosen[:, :size], -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT

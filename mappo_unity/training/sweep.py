@@ -86,7 +86,6 @@ def run_sweep(lines: list[str], file: Path | None = None) -> SweepResult:
     """
     plan = plan_jobs(lines, file, lambda text: print(text, flush=True))
     folder = _sweep_folder(lines, plan)
-
     result, patience = SweepResult(folder.path), SweepSignalHandler()
 
     try:
@@ -213,7 +212,6 @@ def _launch(lines: list[str], file: Path | None) -> None:
     # Hydra refuses to start where an earlier one of this process is left.
     GlobalHydra.instance().clear()
     search_path = create_config_search_path(str(conf_dir()))
-
     hydra = Hydra.create_main_hydra2("mappo-train", search_path)
     try:
         lines = [add_plus_prefix(line) for line in all_to_hydra_syntax(lines)]
