@@ -53,7 +53,7 @@ def plan_jobs(
     task = all_to_hydra_syntax([line for line in lines if not is_hydra(line)])
     hydra = [line for line in lines if is_hydra(line)]
 
-    # Sizes before jobs: a sweep that is too large is refused before its jobs are listed.
+    # Of a grid the sizes come first: one that is too large is refused before its jobs are listed.
     if is_search(lines):
         jobs = [[line for line in task if not parse([line])[0].is_sweep_override()]]
         first = _compose_job(jobs[0], hydra, file)
@@ -166,9 +166,8 @@ def _configs(jobs: list[list[str]], hydra: list[str], file: Path | None, first: 
             line for line, override in zip(job, overrides) if override.key_or_group in group_choices()
         )
         changed = [override for override in overrides if override.get_key_element() in swept]
-        is_merged = any(
-            isinstance(override.value(), dict) for override in changed
-        )  # with what was there before
+        # Several options given as one are merged with what was there before.
+        is_merged = any(isinstance(override.value(), dict) for override in changed)
 
         # Jobs with the same presets differ in plain values only: those are set in a tree composed before.
         if presets not in trees or is_merged:

@@ -190,7 +190,7 @@ def make_learners(
         layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
         check_network_memory(name, obs, layout, team_size, model)
 
-        # Memory is checked before these are built.
+        # Built after the check, so that what does not fit is refused by a line of ours.
         actor = make_actor(obs, layout, team_size, model).to(cfg.device)
         critic = make_critic(obs, team_size, model).to(cfg.device)
         learners[name] = PolicyLearner(actor, critic, ppo, rounds * teams, team_size)

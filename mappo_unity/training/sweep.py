@@ -124,9 +124,8 @@ def _run_job(tree: DictConfig) -> float | None:
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
     result = JobResult(int(hydra.job.num), [line.lstrip("+") for line in hydra.overrides.task], "failed")
-    print(
-        f"job {result.job}: {' '.join(result.overrides)}\n", end="", flush=True
-    )  # one write: jobs print side by side
+    # One write, its newline included: jobs print side by side.
+    print(f"job {result.job}: {' '.join(result.overrides)}\n", end="", flush=True)
 
     start_s = time.monotonic()
     ended_by: int | None = None
@@ -216,10 +215,8 @@ def _launch(lines: list[str], file: Path | None) -> None:
     try:
         lines = [add_plus_prefix(line) for line in all_to_hydra_syntax(lines)]
         if all(last_value(lines, key) in (None, "basic") for key in ("hydra/sweeper", "hydra/launcher")):
-            lines = [
-                "hydra.sweeper.max_batch_size=1",
-                *lines,
-            ]  # Hydra composes a whole batch before its first job
+            # Hydra composes a whole batch before its first job.
+            lines = ["hydra.sweeper.max_batch_size=1", *lines]
 
         hydra.multirun(register_root(lines, file=file), run_job, lines)
     finally:
