@@ -40,6 +40,7 @@ def play(
     counts = _Counts(episodes)
     checks: dict[str, RecordCheck] = {}
     silent = 0  # steps in a row in which nobody asked
+
     env.reset()
     check_specs(env.behavior_specs)
     for _ in range(MAX_ENV_STEPS):
@@ -51,11 +52,13 @@ def play(
             _forget_crashed(env, name, running, counts)
             _end_episodes(name, terminal, running, counts)
             actor = policy[name] if isinstance(policy, dict) else policy
+            # Who is not running here begins an episode: what it remembers is of another.
             actor.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
             _go_on(name, decision, running, counts)
             if len(decision):
                 silent = 0
                 env.set_actions(name, actor.act(name, decision, env.behavior_specs[name]))
+
         names = [only] if only else list(env.behavior_specs)
         if names and counts.complete(names):
             return counts.ended
@@ -63,6 +66,7 @@ def play(
         if silent >= MAX_SILENT_STEPS:
             raise silence_error(silent)
         env.step()
+
     ended = {name: len(counts.ended.get(name, [])) for name in env.behavior_specs}
     raise EnvironmentFailure(
         f"episodes={episodes}: so many did not end within {MAX_ENV_STEPS:,} environment steps, only {ended}; "
@@ -99,11 +103,13 @@ def _end_episodes(name: str, terminal: Any, running: dict, counts: _Counts) -> N
         episode = running.pop((name, agent), None)
         if episode is None:
             continue
+
         counted, individual, group, length = episode
         individual, group = (
             individual + float(terminal.reward[row]),
             group + float(terminal.group_reward[row]),
         )
+
         if counted:
             cut, group_id = bool(terminal.interrupted[row]), int(terminal.group_id[row])
             ended = Episode(agent, individual, group, int(length), cut, group_id)
@@ -115,6 +121,7 @@ def _go_on(name: str, decision: Any, running: dict, counts: _Counts) -> None:
         episode = running.get((name, agent))
         if episode is None:
             episode = running[name, agent] = [float(counts.begin(name)), 0.0, 0.0, 0.0]
+
         episode[1] += float(decision.reward[row])
         episode[2] += float(decision.group_reward[row])
         episode[3] += 1
@@ -125,6 +132,7 @@ def summarize(episodes: list[Episode]) -> dict[str, Any]:
     individual, group = (
         np.array(x, float) for x in zip(*[(e.individual_return, e.group_return) for e in episodes])
     )
+
     returns = individual + group
     out = {
         "episodes": len(episodes),
@@ -133,8 +141,10 @@ def summarize(episodes: list[Episode]) -> dict[str, Any]:
         "mean_decisions": float(np.mean([e.length for e in episodes])),
         "interrupted": float(np.mean([e.interrupted for e in episodes])),
     }
+
     if group.any():
         out |= {"mean_individual_return": float(individual.mean()), "mean_group_return": float(group.mean())}
+
     return out
 
 
@@ -148,4 +158,5 @@ def standard_error(values: np.ndarray, teams: bool = False) -> float:
         batches = np.array_split(values, min(NUM_BATCHES, len(values) // MIN_BATCH))
         values = np.array([batch.mean() for batch in batches])
         return float(values.std(ddof=1) / math.sqrt(len(values)))
+
     return float(values.std() / math.sqrt(len(values)))

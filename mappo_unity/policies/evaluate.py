@@ -43,23 +43,28 @@ def evaluate(
     """
     torch.set_num_threads(1)
     torch.manual_seed(seed)
+
     policy = open_policy(str(run), deterministic, seed)
     make_env = make_env_function(config_to_play(run, env).env)
+
     head = {"policy": str(getattr(policy, "path", run)), "deterministic": deterministic, "seed": seed}
     head |= (
         {"agent_steps": policy.agent_steps}
         if isinstance(policy, (CheckpointPolicy, OnnxPolicy, OnnxFolder))
         else {}
     )
+
     if opponent is not None:
         other = open_policy(opponent, deterministic, seed, "opponent")
         scores = play_matches(make_env, policy, other, episodes, seed)
         return head | {"opponent": opponent} | match_figures(scores)
+
     base_env = make_env(seed)
     try:
         finished = play(base_env, policy, episodes)
     finally:
         base_env.close()
+
     behaviors = {name: summarize(rows) for name, rows in finished.items()}
     return head | (next(iter(behaviors.values())) if len(behaviors) == 1 else {"behaviors": behaviors})
 

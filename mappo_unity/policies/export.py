@@ -57,13 +57,17 @@ def export_checkpoint(path: Path, out: Path | None = None) -> list[Exported]:
     """
     with torch.random.fork_rng(devices=[]):  # building networks draws weights
         policy = CheckpointPolicy(path, deterministic=True)
+
     state = checkpoint.load(path)
     paths = _output_paths(list(policy.layout), path, out)
+
     written = []
     for name, layout in policy.layout.items():
         metadata = {"agent_steps": str(policy.agent_steps), "env_name": state["env_name"]}
         actor: Any = policy.actors[name]
         data = build_model(actor[0].module, layout["sensors"], name, metadata).SerializeToString()
+
+        # What cannot be compared is refused, before anything is written.
         sample = state.get("samples", {}).get(name, {})
         rows = len(next(iter(sample.values()), ()))
         if not rows:
@@ -71,11 +75,14 @@ def export_checkpoint(path: Path, out: Path | None = None) -> list[Exported]:
                 f"checkpoint {path} holds no observations of {name!r} to compare an export with; "
                 "let its run go on for an iteration (mappo-train resume=...), which writes one that does"
             )
+
         error = compare(data, actor, layout["sensors"], sample)
         written.append((data, Exported(name, paths[name], policy.agent_steps, rows, error)))
+
     with interrupts_wait():  # all of them, or none
         for data, exported in written:
             _write(exported.path, data)
+
     return [exported for _, exported in written]
 
 
@@ -93,6 +100,7 @@ def sample_inputs(entries: TensorDictBase, in_keys: Sequence[str]) -> dict[str, 
     rows = acting.flatten().nonzero()[:, 0]
     if len(rows) > SAMPLE_ROWS:
         rows = rows[torch.linspace(0, len(rows) - 1, SAMPLE_ROWS).long()]
+
     return {key: entries.get(key).flatten(0, acting.ndim - 1)[rows].cpu() for key in in_keys}
 
 
@@ -119,7 +127,9 @@ class RunExports:
         start = time.monotonic()
         if start < self._next_at:
             return
+
         self._export(checkpoint.BEST)
+        # The pause grows with what an export takes, so that a slow one keeps to its share of the run.
         end = time.monotonic()
         self._next_at = end + max(PAUSE_S, (end - start) / MAX_SHARE)
 
@@ -134,6 +144,7 @@ class RunExports:
         path = self.folder / name
         if not path.is_file():
             return
+
         try:
             export_checkpoint(path, None if out is None else self.folder / out)
         except Exception as error:

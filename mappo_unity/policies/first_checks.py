@@ -63,6 +63,7 @@ def check_film(cfg: PlayConfig) -> None:
     option = "run" if cfg.run is not None else "policy"
     source = locate(cfg.run or cfg.policy or "random", option)
     known = _open(source, cfg.deterministic)
+
     config = _environment(source, known, cfg.env, "mappo-play")
     check_embedded(config.env)
     check_environment(config)
@@ -88,6 +89,7 @@ def check_out(out: str) -> None:
     """Raise ConfigError if an export cannot go there: another ending, no place for a file, no permission."""
     path = Path(out)
     wanted = "give a file NAME.onnx, or a folder"
+
     try:
         is_folder = stat.S_ISDIR(path.stat().st_mode)
         is_file = stat.S_ISREG(path.stat().st_mode)
@@ -110,6 +112,8 @@ def check_out(out: str) -> None:
             f"out={out} does not end in {SUFFIX}: ONNX files do, out={path.with_suffix(SUFFIX)}; a new "
             f"folder of that name is out={out}/"
         )
+
+    # What is not there yet is made in the nearest folder above it that is there.
     folder = next(folder for folder in (path, *path.absolute().parents) if folder.is_dir())
     if not os.access(folder, os.W_OK | os.X_OK):
         raise ConfigError(f"out={out} cannot be written: no permission to write in the folder {folder}")
@@ -148,6 +152,7 @@ def _open(source: Source, deterministic: bool) -> Any:
 def _environment(source: Source, known: Any, env: str | None, command: str) -> Config:
     """Return the options of the environment to play in; see `config_to_play`."""
     scenes = [name for name in group_choices()["env"] if name in scene_names()]
+
     if env is None and (source.kind is Kind.random or not _lies_in_run(source)):
         trained = _trained_in(known)
         example = trained if trained in scenes else "NAME"
@@ -157,11 +162,13 @@ def _environment(source: Source, known: Any, env: str | None, command: str) -> C
             f"{source.option}={source.path} {reason}: say in which environment to play it: env={example} "
             f"({', '.join(scenes)})"
         )
+
     if env in group_choices()["env"] and env not in scenes:
         raise ConfigError(
             f"env={env} needs options of an environment of your own, which {command} does not take: leave "
             "env out and name a run of that environment, or a file in its folder, and its own options count"
         )
+
     return config_to_play(source.path, env)
 
 
@@ -184,6 +191,8 @@ def _behaviors(env: EnvConfig) -> Mapping[str, Any]:
     """Return the specs of an embedded scene's behaviors; nothing of others, which are not started here."""
     if env.backend is not Backend.embedded:
         return {}
+
+    # One area is enough to see them.
     scene = make_env_function(replace(env, num_areas=1))(0)
     try:
         scene.reset()

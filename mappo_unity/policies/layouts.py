@@ -38,6 +38,7 @@ def check_layout(owner: str, layout: Mapping[str, Any], behavior: str, spec: Beh
         raise ConfigError(
             f"{owner} cannot play {behavior!r}: it holds {_names(layout)}, trained for another environment"
         )
+
     found = describe_spec(spec, layout[name]["team_size"])
     if layout[name] != found:
         raise ConfigError(

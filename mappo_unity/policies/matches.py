@@ -75,16 +75,19 @@ def play_matches(
         ConfigError: the environment has not two sides.
     """
     scores: dict[str, Score] = {}
+
     env = make_env(seed)
     try:
         sides = find_sides(env)
         for index, side in enumerate(sides):
             own, other = sides[side], [b for s, names in sides.items() if s != side for b in names]
             policies = dict.fromkeys(own, policy) | dict.fromkeys(other, opponent)
+            # Of an odd number of matches the first side gets one more.
             count = (matches + 1 - index) // 2
             scores["+".join(own)] = play_side(env, policies, own, max(1, count))
     finally:
         env.close()
+
     return scores
 
 
@@ -104,6 +107,7 @@ def play_side(env: BaseEnv, policies: dict[str, Policy], own: list[str], matches
     env.reset()
     groups = env.get_steps(name)[0].group_id
     members = max(1, int((groups == groups[0]).sum())) if groups[0] > 0 else 1
+    # Each member of a team has an agent episode of its own in every match.
     episodes = play(env, policies, matches * members, only=name)[name]
     return count(episodes, grouped=bool(groups[0] > 0))
 
@@ -113,16 +117,20 @@ def count(episodes: list[Episode], grouped: bool) -> Score:
     score = Score()
     ends_of: dict[tuple[int, int], int] = {}
     seen: set[tuple[int, int]] = set()
+
     for episode in episodes:
         if grouped:
+            # An agent's n-th end belongs to the n-th match of its group.
             agent = (episode.group_id, episode.agent_id)
             ends_of[agent] = ends_of.get(agent, 0) + 1
             match = (episode.group_id, ends_of[agent])
             if match in seen:
                 continue
             seen.add(match)
+
         result = episode.group_return if grouped else episode.individual_return
         score += Score(int(result > 0), int(result == 0), int(result < 0), episode.length)
+
     return score
 
 

@@ -44,17 +44,21 @@ def compare(
     with torch.no_grad():
         params = actor[0](TensorDict(sample, [len(next(iter(sample.values())))])).get("params")
     expected = ActionDistribution(params, actor[0].module.layout, sample.get(keys.MASK))
+
     found = _run(session, feed, "deterministic_", expected)
     error = max(_continuous_error(expected, found), _branch_error(expected, found))
+    # Asked this way round because nan, which is above no tolerance, must not pass.
     if not error <= TOLERANCE:
         raise ExportError(
             "the export plays otherwise than the checkpoint: its deterministic actions differ by "
             f"{error:.3g}, more than {TOLERANCE:g}"
         )
+
     runs = math.ceil(DRAWS / len(params))
     drawn = [_run(session, feed, "", expected) for _ in range(runs)]
     _compare_continuous(expected, drawn)
     _compare_branches(expected, drawn)
+
     return error
 
 
@@ -65,6 +69,8 @@ def _feed(
     arrays = {key: values.numpy() for key, values in sample.items()}
     shapes = {i.name: list(i.shape) for i in session.get_inputs()}
     feed, start = {}, 0
+
+    # The actor takes all vectors as one entry; each sensor has its columns of it, in their order.
     for index, shape in enumerate(sensors):
         name = f"obs_{index}"
         if len(shape) == 1:
@@ -72,8 +78,10 @@ def _feed(
             start += shape[0]
         else:
             feed[name] = fit_image(arrays[keys.SENSOR.format(index)], shapes[name])
+
     if keys.MASK in arrays:
         feed["action_masks"] = arrays[keys.MASK]
+
     return {name: np.ascontiguousarray(values, np.float32) for name, values in feed.items()}
 
 
@@ -96,6 +104,8 @@ def _continuous_error(expected: ActionDistribution, found: dict[str, torch.Tenso
 def _branch_error(expected: ActionDistribution, found: dict[str, torch.Tensor]) -> float:
     if "discrete" not in found:
         return 0.0
+
+    # Equally good branches may be chosen differently: what counts is how much worse the choice is.
     chosen = expected.layout.to_categories(found["discrete"])
     shortfall = [
         log_probs.max(-1).values - log_probs.gather(-1, chosen[:, branch, None])[:, 0]
@@ -108,12 +118,15 @@ def _compare_continuous(expected: ActionDistribution, drawn: list[dict[str, torc
     """Compare how many draws lie below mean - std, mean and mean + std, where clipping is no matter."""
     if "continuous" not in drawn[0]:
         return
+
     draws = torch.stack([d["continuous"] for d in drawn]) * CONTINUOUS_LIMIT
     std = expected.log_std.exp()
     for sigmas in (-1.0, 0.0, 1.0):
         limit = expected.loc + sigmas * std
         inside = limit.abs() < CONTINUOUS_LIMIT - 1e-3
         share = 0.5 * (1 + math.erf(sigmas / math.sqrt(2)))
+
+        # The number of draws below a limit is binomial: mean n p, variance n p (1 - p).
         count = inside.sum(0) * len(draws)
         below = ((draws <= limit) & inside).sum((0, 1))
         _require(below, count * share, count * share * (1 - share), "continuous actions")
@@ -123,12 +136,16 @@ def _compare_branches(expected: ActionDistribution, drawn: list[dict[str, torch.
     """Compare how often each category was drawn."""
     if "discrete" not in drawn[0]:
         return
+
     chosen = expected.layout.to_categories(torch.stack([d["discrete"] for d in drawn]))
     for branch, log_probs in enumerate(expected.log_probs):
         probs = log_probs.double().exp()
         counts = torch.nn.functional.one_hot(chosen[..., branch], probs.shape[-1]).sum(0)
+
+        # Chance excuses no forbidden action, however few there are.
         if (counts[probs == 0] > 0).any():
             raise ExportError(f"the export draws forbidden actions of branch {branch}")
+
         mean, var = probs * len(chosen), probs * (1 - probs) * len(chosen)
         _require(counts.sum(0), mean.sum(0), var.sum(0), f"actions of branch {branch}")
 

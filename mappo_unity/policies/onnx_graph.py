@@ -57,6 +57,7 @@ def build_model(
     graph = _Graph(onnx)
     graph.tell("version_number", [FORMAT], [1])
     graph.tell("memory_size", [0.0], [1])
+
     *body, head = network.net
     if not isinstance(head, nn.Linear):
         raise ExportError(f"the policy network ends in {with_article(type(head).__name__)}, not in a Linear")
@@ -65,6 +66,7 @@ def build_model(
         _continuous_head(graph, hidden, head, network.log_std, network.layout.continuous)
     if network.layout.branches:
         _discrete_heads(graph, hidden, head, network.layout)
+
     model = onnx.helper.make_model(
         onnx.helper.make_graph(graph.nodes, name, graph.inputs, graph.outputs, graph.weights),
         producer_name="mappo-unity",
@@ -74,6 +76,7 @@ def build_model(
     )
     onnx.helper.set_model_props(model, {"behavior_name": name, **(metadata or {})})
     onnx.checker.check_model(model, full_check=True)
+
     return model
 
 
@@ -198,6 +201,8 @@ def _features(graph: _Graph, encoder: Encoder, sensors: Sequence[Sequence[int]])
         x = graph.input(name, channels_first(shape) if image.channels_last else shape)
         x = graph.layer(image.conv, x, f"{name}.conv")
         features.append(graph.layer(image.out, x, f"{name}.out"))
+
+    # The MLP takes the vectors first, wherever their sensors stand.
     if vectors:
         features.insert(0, graph.layer(encoder.norm, graph.node("Concat", vectors, axis=1), "norm"))
     return graph.node("Concat", features, axis=1) if len(features) > 1 else features[0]
@@ -270,9 +275,12 @@ def _joint_categorical(graph: _Graph, logits: str, masks: str, layout: ActionLay
         graph.node("Gather", [masks, graph.constant(f"columns.{k}", column, np.int64)], axis=1)
         for k, column in enumerate((combinations + offsets).T)
     ]
+
+    # A combination is allowed where all of its branches are: the product of their masks.
     mask = parts[0]
     for part in parts[1:]:
         mask = graph.node("Mul", [mask, part])
+
     table = graph.constant("combinations", combinations, np.int64)
     draw, mode = _categorical(graph, logits, mask)
     names = (draw, "discrete_actions"), (mode, "deterministic_discrete_actions")

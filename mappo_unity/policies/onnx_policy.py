@@ -39,13 +39,16 @@ class OnnxPolicy:
     def __init__(self, path: Path, deterministic: bool, seed: int = 0) -> None:
         if not path.is_file():
             raise ConfigError(f"the ONNX file {path} does not exist")
+
         self.path, self.deterministic = path, deterministic
         self.session = open_session(path.read_bytes(), str(path), seed)
         self.metadata: dict[str, str] = self.session.get_modelmeta().custom_metadata_map
         steps = self.metadata.get("agent_steps", "")
         self.agent_steps = int(steps) if steps.isdigit() else None
+
         self.inputs = {i.name: list(i.shape) for i in self.session.get_inputs()}
         self.outputs = {o.name: list(o.shape) for o in self.session.get_outputs()}
+
         self.rng = np.random.default_rng(seed)
         self._memory: dict[tuple[str, int], np.ndarray] = {}
         self._fits: set[str] = set()
@@ -60,13 +63,16 @@ class OnnxPolicy:
         if "recurrent_out" in out:
             memory = out["recurrent_out"].reshape(len(steps), -1)
             self._memory.update({(behavior, a): m for a, m in zip(steps.agent_id.tolist(), memory)})
+
         action = ActionTuple()
         if spec.action_spec.continuous_size:
             action.add_continuous(out[self._output("continuous_actions")].astype(np.float32))
+
         if branches:
             chosen = out[self._output("discrete_actions")]
             chosen = self._draw(chosen, branches) if np.issubdtype(chosen.dtype, np.floating) else chosen
             action.add_discrete(chosen.astype(np.int32))
+
         return action
 
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
@@ -84,12 +90,14 @@ class OnnxPolicy:
                 f"the ONNX file {self.path} plays {name!r}, but the environment has {behavior!r}; "
                 "a folder with a file for each behavior plays several"
             )
+
         wanted, given = self._wanted_sizes(), self._given_sizes(spec)
         if wanted != given:
             raise ConfigError(
                 f"the ONNX file {self.path} cannot play {behavior!r}: it takes and gives "
                 f"{_show(wanted)}, but the environment has {_show(given)}"
             )
+
         self._fits.add(behavior)
 
     def _check_outputs(self) -> None:
@@ -99,6 +107,7 @@ class OnnxPolicy:
                 f"the ONNX file {self.path} is no ML-Agents model of format 2 or 3: its inputs are "
                 f"{list(self.inputs)}, its outputs {list(self.outputs)}"
             )
+
         for name in actions:
             if self.deterministic and self._output(name) == name and not self._gives_log_probs(name):
                 raise ConfigError(
@@ -132,21 +141,27 @@ class OnnxPolicy:
             sizes = {"vector_observation": [sum(vectors)]} if vectors else {}
             images = [s for s in sensors if len(s) == 3]
             sizes |= {f"visual_observation_{i}": shape for i, shape in enumerate(images)}
+
+        # Files take images channels last or first; what theirs are, their inputs tell.
         for name, shape in sizes.items():
             if self.inputs.get(name, [])[1:] == _channels_first(shape):
                 sizes[name] = _channels_first(shape)
+
         continuous, branches = spec.action_spec.continuous_size, spec.action_spec.discrete_branches
         if continuous:
             sizes["continuous_actions"] = [continuous]
         if branches:
+            # Format 2 gives a log-probability for every choice, format 3 the choice of each branch.
             log_probs = "discrete_actions" in self.outputs and self._gives_log_probs("discrete_actions")
             sizes["action_masks"] = [sum(branches)]
             sizes["discrete_actions"] = [sum(branches) if log_probs else len(branches)]
+
         return sizes
 
     def _feed(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> dict[str, np.ndarray]:
         vectors = [o for o in steps.obs if o.ndim == 2]
         images = [o for o in steps.obs if o.ndim == 4]
+
         feed = {}
         for name, shape in self.inputs.items():
             index = int(name.rpartition("_")[2]) if name.startswith(("obs_", "visual_")) else 0
@@ -162,11 +177,13 @@ class OnnxPolicy:
                 zeros = np.zeros(shape[-1], np.float32)
                 rows = [self._memory.get((behavior, agent), zeros) for agent in steps.agent_id.tolist()]
                 feed[name] = np.stack(rows).reshape(len(steps), 1, -1)
+
         return {name: np.ascontiguousarray(values, np.float32) for name, values in feed.items()}
 
     def _draw(self, log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarray:
         """Branches ``[n, K]`` from the log-probabilities ``[n, sum of branches]`` of format 2."""
         parts = np.split(log_probs, np.cumsum(branches)[:-1], axis=1)
+        # The largest sum of log-probability and Gumbel noise is a draw from the probabilities.
         noise = [0.0 if self.deterministic else self.rng.gumbel(size=part.shape) for part in parts]
         return np.stack([(part + extra).argmax(1) for part, extra in zip(parts, noise)], axis=1)
 
@@ -229,7 +246,9 @@ def open_session(data: bytes, name: str, seed: int = 0) -> Any:
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3  # files of ML-Agents bring warnings about declared shapes
+    # Before the session is made: its random operators take their seeds from it.
     runtime.set_seed(seed)
+
     try:
         return runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises many kinds, without a common base

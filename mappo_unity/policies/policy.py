@@ -59,12 +59,15 @@ class RandomPolicy:
         """Return an action for every row of ``steps``."""
         action, count = ActionTuple(), len(steps)
         size, branches = spec.action_spec.continuous_size, spec.action_spec.discrete_branches
+
         if size:
             action.add_continuous(self.rng.uniform(-1, 1, (count, size)).astype(np.float32))
         if branches:
+            # A mask is True where a branch is forbidden; such a branch scores below every draw.
             masks = steps.action_mask or [np.zeros((count, n), bool) for n in branches]
             scores = [np.where(np.asarray(m, bool), -1.0, self.rng.random(m.shape)) for m in masks]
             action.add_discrete(np.stack([s.argmax(1) for s in scores], 1).astype(np.int32))
+
         return action
 
 
@@ -88,12 +91,16 @@ class ActorPolicy:
         """Return an action for every row of ``steps``."""
         name = keys.policy_name(behavior)
         self.check(behavior, spec)
+
         places = team_places(steps.group_id, self.layout[name]["team_size"])
         device = next(self.actors[name].parameters()).device
         entries = {k: _spread(v, places).to(device) for k, v in _inputs(steps, spec).items()}
+
         kind = ExplorationType.DETERMINISTIC if self.deterministic else ExplorationType.RANDOM
         with set_exploration_type(kind):
             out = self.actors[name](TensorDict(entries, places.shape)).get(keys.ACTION)
+
+        # Back to the rows of `steps`: the network gives whole teams, with their empty places.
         chosen = out.cpu().numpy()[places.teams, places.members]
         size, action = spec.action_spec.continuous_size, ActionTuple()
         if size:
@@ -101,6 +108,7 @@ class ActorPolicy:
             action.add_continuous(scaled.astype(np.float32))
         if spec.action_spec.discrete_size:
             action.add_discrete(chosen[:, size:].astype(np.int32))
+
         return action
 
     def check(self, behavior: str, spec: BehaviorSpec) -> None:
@@ -140,17 +148,22 @@ def team_places(group_id: np.ndarray, team_size: int) -> Places:
     Members that are not asked at the same time are not told apart by this; it matters only to
     policies with a network for each member.
     """
+    # Group 0 is none: each of its agents is a team of its own, numbered after the groups.
     alone = np.arange(len(group_id)) + int(group_id.max(initial=0)) + 1
     keys_ = np.where(group_id > 0, group_id, alone)
     _, teams = np.unique(keys_, return_inverse=True)
+
+    # Stable, so that the members of a team keep the order of their rows.
     order = np.argsort(teams, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(teams[order]) > 0])
     members = np.empty(len(teams), np.int64)
     members[order] = np.arange(len(teams)) - np.repeat(starts, np.diff(np.r_[starts, len(teams)]))
+
     if members.max(initial=0) >= team_size:
         raise ConfigError(
             f"a team of {members.max() + 1} agents is larger than the policy's {team_size} members"
         )
+
     return Places(teams, members, (int(teams.max(initial=-1)) + 1, team_size))
 
 
@@ -158,13 +171,17 @@ def _inputs(steps: DecisionSteps, spec: BehaviorSpec) -> dict[str, np.ndarray]:
     """The entries of a network's input, a row for each agent."""
     shapes = [o.shape for o in spec.observation_specs]
     entries = {keys.SENSOR.format(i): o for i, o in enumerate(steps.obs) if len(shapes[i]) == 3}
+
     vectors = [o for o, shape in zip(steps.obs, shapes) if len(shape) == 1]
     if vectors:
         entries[keys.OBS] = np.concatenate(vectors, 1).astype(np.float32)
+
+    # ML-Agents marks what is forbidden, the network takes what is allowed.
     if spec.action_spec.discrete_size:
         count, total = len(steps), sum(spec.action_spec.discrete_branches)
         forbidden = np.concatenate(steps.action_mask, 1) if steps.action_mask else np.zeros((count, total))
         entries[keys.MASK] = ~forbidden.astype(bool)
+
     return entries
 
 
@@ -181,6 +198,7 @@ def _actor(state: dict[str, Any], name: str) -> Any:
     actions = ActionLayout.from_spec(
         ActionSpec(layout["continuous"], tuple(layout["branches"])), model.flatten_branches
     )
+
     actor = make_actor(ObsLayout.from_shapes(layout["sensors"]), actions, layout["team_size"], model)
     actor.load_state_dict(state["learners"][name]["actor"])
     return actor.eval()

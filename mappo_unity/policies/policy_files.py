@@ -61,6 +61,7 @@ def locate(where: str, option: str) -> Source:
     path = Path(where)
     if where == RANDOM:
         return Source(Kind.random, path, option)
+
     check_there(path, option, f": give {PLAYABLE}")
     if path.is_dir():
         return _folder(path, option)
@@ -70,13 +71,17 @@ def locate(where: str, option: str) -> Source:
 def check_resumable(path: Path, option: str) -> None:
     """Raise ConfigError for an ONNX file or a folder of them, and for a file that is no checkpoint."""
     check_there(path, option)
+
     wanted = "a run folder or a checkpoint (.pt)"
     if path.is_dir():
         if (path / CONFIG).is_file() or (path.parent / CONFIG).is_file() or not list(path.glob(f"*{SUFFIX}")):
             return
         raise ConfigError(f"{option}={path} is a folder of ONNX files: {option} takes {wanted}")
+
     if _kind_of_file(path, option, wanted) is Kind.checkpoint:
         return
+
+    # An ONNX file in the folder of a run: that run can be named instead.
     run = next((folder for folder in path.parents if (folder / CONFIG).is_file()), None)
     instead = f"; its run: {shell_argument(option, run)}" if run is not None else ""
     if option == "resume":
@@ -86,6 +91,7 @@ def check_resumable(path: Path, option: str) -> None:
     else:
         reason = "it needs no export"
         use = "Unity loads it as it is"
+
     raise ConfigError(
         f"{option}={path} is an ONNX file: {reason}. {option} takes {wanted}{instead}. An ONNX file is for "
         f"playing: {use}"
@@ -100,10 +106,12 @@ def choose_checkpoint(run: Path, option: str = "run") -> Path:
     """
     if not run.is_dir():
         return run
+
     run = _folder(run, option).path
     best = run / FOLDER / BEST
     if best.is_file():
         return best
+
     path, warnings = newest_good(run)
     for warning in warnings:
         logger.warning("%s; %s is taken", warning, path)
@@ -126,11 +134,14 @@ def _folder(path: Path, option: str) -> Source:
     numbered, best = checkpoints_in(path), path / FOLDER / BEST
     if numbered or best.is_file():
         return Source(Kind.run, path, option)
+
     whole = Path(os.path.abspath(path)) if path.name in ("", "..") else path  # "." has no name
     if whole.name == FOLDER and list(path.glob("*.pt")):  # a run's folder of checkpoints
         return Source(Kind.run, whole.parent, option)
+
     if list(path.glob(f"*{SUFFIX}")):
         return Source(Kind.onnx_folder, path, option)
+
     wanted = f"{FOLDER}/{BEST}, {FOLDER}/step_*.pt, *{SUFFIX}"
     raise ConfigError(
         f"{option}={path} holds no policy: that folder has none of {wanted}{_files(path)}{runs_below(path)}"
@@ -145,9 +156,11 @@ def _files(folder: Path) -> str:
 def _kind_of_file(path: Path, option: str, wanted: str) -> Kind:
     if not path.is_file():
         raise ConfigError(f"{option}={path} is no file: give {wanted}")
+
     if path.suffix.lower() == SUFFIX:
         return Kind.onnx
     if path.suffix == ".pt" or zipfile.is_zipfile(path):
         return Kind.checkpoint
+
     what = "empty" if path.stat().st_size == 0 else "neither a checkpoint nor an ONNX file"
     raise ConfigError(f"{option}={path} is {what}: give {wanted}")

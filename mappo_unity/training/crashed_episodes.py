@@ -27,15 +27,19 @@ def mask_crashed_episodes(batch: TensorDictBase, crashes: Sequence[CrashedEpisod
     for crash in crashes:
         name = keys.policy_name(crash.behavior)
         side = env.sides[name].index(crash.behavior) if len(env.sides[name]) > 1 else None
+
         done = _of_side(batch.get(("next", name, keys.DONE)), side)
+        # Rounds count from where the environment was opened; the newest one is the last row.
         last = batch.shape[0] - env.rounds + crash.round
         rows = episode_rows(done, last, torch.from_numpy(crash.slots).unsqueeze(-1))
+
         for key in (keys.ACTING, keys.DEPARTED):
             flags = batch.get((name, key)).clone()
             own = _of_side(flags, side)
             dropped += int((own & rows).sum()) if key == keys.ACTING else 0
             own &= ~rows
             batch.set((name, key), flags)
+
     return dropped
 
 
@@ -48,10 +52,13 @@ def episode_rows(done_T: Tensor, last: int, slots: Tensor) -> Tensor:
     """
     rows = torch.zeros_like(done_T)
     playing = slots.clone()
+
+    # Backwards from the end, until a row in which the episode before it ended.
     for t in range(last, -1, -1):
         if t < last:
             playing &= ~done_T[t]
         rows[t] = playing
+
     return rows
 
 

@@ -32,6 +32,7 @@ class RecentEpisodes:
                     row = (episode.individual_return, episode.group_return, episode.length)
                     self.recent[behavior].append(row)
                     count += 1
+
         self.total += count
         return count
 
@@ -51,9 +52,11 @@ class RecentEpisodes:
         """
         everything = [row for rows in self.recent.values() for row in rows]
         out = _summary("", everything)
+
         if len(self.recent) > 1:
             for behavior, rows in self.recent.items():
                 out |= _summary(f"{behavior}/", list(rows))
+
         return out
 
     def state_dict(self) -> dict[str, Any]:
@@ -74,6 +77,7 @@ def _summary(prefix: str, rows: list[tuple[float, float, int]]) -> dict[str, flo
     if not rows:
         names = ("return_mean", "return_std", "group_return_mean", "episode_length_mean")
         return {f"{prefix}{name}": float("nan") for name in names}
+
     individual, group, length = (np.array(column, float) for column in zip(*rows))
     returns = individual + group
     return {
@@ -96,8 +100,11 @@ def by_policy(metrics: dict[str, dict[str, float]]) -> dict[str, float]:
     """
     if len(metrics) == 1:
         return dict(next(iter(metrics.values())))
+
     names = list(dict.fromkeys(name for row in metrics.values() for name in row))
     out = {name: float(np.mean([row[name] for row in metrics.values() if name in row])) for name in names}
+
     for policy, row in metrics.items():
         out |= {f"{policy}/{name}": value for name, value in row.items()}
+
     return out

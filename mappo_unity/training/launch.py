@@ -64,6 +64,7 @@ def launch(
     resume = last_value(lines, "resume")
     if resume == "":
         raise ConfigError("resume= is empty: it must name a run folder or a checkpoint file")
+
     if resume is not None:
         return _resume(lines, Path(str(resume)), warn, show)
     return _train_new(lines, file, warn, show)

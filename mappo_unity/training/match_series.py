@@ -42,6 +42,7 @@ class MatchSeries:
         self._played_at = 0
         self.points: float | None = None
         self.said = ""
+
         self.two_sided = len(sides_of(names)) == 2
         if cfg.matches.interval is not None and not self.two_sided:
             raise ConfigError(
@@ -65,8 +66,10 @@ class MatchSeries:
             make_env = make_env_function(cfg.env, self._folder / PLAYERS / "matches")
             seed = (cfg.seed + agent_steps) % 2**31
             scores = play_matches(make_env, policy, RandomPolicy(seed), cfg.matches.count, seed)
+
         if self._interval_is_over(agent_steps):  # the last series leaves the rhythm of a longer run alone
             self._played_at = agent_steps
+
         total = sum(scores.values(), Score())
         matches = max(1, total.matches)
         self.points = (total.wins + 0.5 * total.draws) / matches
@@ -74,6 +77,7 @@ class MatchSeries:
             f"{agent_steps:,} steps: of {matches} matches against a random side "
             f"{total.wins} won, {total.draws} drawn, {total.losses} lost"
         )
+
         return {
             "win_rate_vs_random": total.figures()["won_of_decided"],
             "draw_rate_vs_random": total.draws / matches,

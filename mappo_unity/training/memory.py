@@ -67,6 +67,7 @@ def _free_of_container() -> int | None:
         limit = (_CGROUP / "memory.max").read_text().strip()
         used = int((_CGROUP / "memory.current").read_text())
         stat = dict(line.split() for line in (_CGROUP / "memory.stat").read_text().splitlines())
+        # Files in the cache count as used there, but the system gives up the inactive ones when asked.
         return None if limit == "max" else int(limit) - used + int(stat.get("inactive_file", 0))
     except (OSError, ValueError):
         return None

@@ -49,8 +49,11 @@ def plan_jobs(
     check_overrides(lines, Config, group_choices(), sweep=True)
     if last_value(lines, "resume") is not None:
         raise ConfigError("resume cannot be swept: continue one run at a time, without -m")
+
     task = all_to_hydra_syntax([line for line in lines if not is_hydra(line)])
     hydra = [line for line in lines if is_hydra(line)]
+
+    # Of a grid the sizes come first: one that is too large is refused before its jobs are listed.
     if is_search(lines):
         jobs = [[line for line in task if not parse([line])[0].is_sweep_override()]]
         first = _compose_job(jobs[0], hydra, file)
@@ -59,12 +62,18 @@ def plan_jobs(
         first = _compose_job(_first_job(task), hydra, file)
         _check_size(counts, first.config.max_jobs, say)
         jobs = [list(job) for job in BasicSweeper.split_arguments(parse(task), None)[0]]
+
     _check_plugins(first.tree)
     configs = _configs(jobs, hydra, file, first)
+
+    # Jobs mostly share their environment: it is looked at once for each factory.
     for config in {config.env.factory: config for config in configs}.values():
         check_environment(config)
+
+    # Whether an option has an effect depends on the backend, which such a search has not chosen yet.
     if not is_search(lines) or not _sweeps_backend(task):
         check_effect(list(dict.fromkeys(line for job in jobs for line in job)), configs)
+
     return Plan(jobs, configs, first)
 
 
@@ -87,10 +96,12 @@ def _count_values(lines: list[str]) -> dict[str, int]:
                 f"{line}: an interval has no list of values; search it with hydra/sweeper=optuna, "
                 f"or give values: {override.key_or_group}=a,b,c"
             )
+
         count = _length(override)
         if count == 0:
             raise ConfigError(f"{line} has no value: the sweep would be empty")
         counts[override.key_or_group] = count
+
     return counts
 
 
@@ -110,6 +121,7 @@ def _first_job(lines: list[str]) -> list[str]:
             job[key] = f"{key}={next(iter(override.sweep_string_iterator()))}"
         else:
             job[key] = f"{key}={override.get_value_element_as_str()}"
+
     return list(job.values())
 
 
@@ -131,6 +143,7 @@ def _check_plugins(tree: DictConfig) -> None:
         value = OmegaConf.select(tree, key)
         if value is not None and not (isinstance(value, int) and value >= low):
             raise ConfigError(f"{key}={value} is out of range: it must be a whole number >= {low}")
+
     rate = OmegaConf.select(tree, _FAILURES)
     if rate is not None and not 0 <= rate <= 1:
         raise ConfigError(f"{_FAILURES}={rate} is out of range: it must be from 0 to 1")
@@ -142,24 +155,28 @@ def _configs(jobs: list[list[str]], hydra: list[str], file: Path | None, first: 
     """Return each job's options; composed anew, which takes long, are only those that need it."""
     if len(jobs) == 1:
         return [first.config]
+
     swept = {key for key, values in _values(jobs).items() if len(values) > 1}
     trees: dict[tuple[str, ...], DictConfig] = {}
     configs = []
+
     for job in jobs:
         overrides = parse(job)
         presets = tuple(
             line for line, override in zip(job, overrides) if override.key_or_group in group_choices()
         )
         changed = [override for override in overrides if override.get_key_element() in swept]
-        is_merged = any(
-            isinstance(override.value(), dict) for override in changed
-        )  # with what was there before
+        # Several options given as one are merged with what was there before.
+        is_merged = any(isinstance(override.value(), dict) for override in changed)
+
+        # Jobs with the same presets differ in plain values only: those are set in a tree composed before.
         if presets not in trees or is_merged:
             composed = _compose_job(job, hydra, file)
             trees[presets] = _options(composed.tree)
             configs.append(composed.config)
         else:
             configs.append(_changed(trees[presets], changed, job))
+
     return configs
 
 

@@ -32,16 +32,19 @@ def check_compatible(
         raise CheckpointError(
             f"checkpoint {path} was written for env={state['env_name']}, not for env={env_name}"
         )
+
     if state["layout"] != layout:
         raise CheckpointError(
             f"checkpoint {path} was written for policies {state['layout']}, but the environment has {layout}"
         )
+
     different = []
     defaults = plain(asdict(ModelConfig()))
     for name, model in models.items():
         # an option that the checkpoint does not know yet had its default's effect
         saved = defaults | state["model"][name]
         different += [f"model.{k}={saved[k]} there, {v} here" for k, v in model.items() if saved[k] != v]
+
     if different:
         raise CheckpointError(f"checkpoint {path} holds another network: {'; '.join(different)}")
 

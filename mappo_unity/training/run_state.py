@@ -72,9 +72,11 @@ class RunState:
         env = self.setup.env
         if env.restarts is None:
             return {}
+
         crashed = env.pop_crashed_episodes()
         self.dropped_steps += mask_crashed_episodes(batch, crashed, env)
         self.dropped_episodes += sum(int(crash.slots.sum()) for crash in crashed)
+
         return {
             "restarts": float(self.restarts),
             "dropped_episodes": float(self.dropped_episodes),
@@ -93,6 +95,7 @@ class RunState:
         self.samples = {
             name: sample_inputs(batch.get(name), learner.actor.in_keys) for name, learner in learners.items()
         }
+
         self.iteration += 1
         self.agent_steps += steps
         self.wall_s += seconds
@@ -135,6 +138,7 @@ class RunState:
             "rng": get_rng_state(),
             "samples": self.samples,
             **{name: getattr(self, name) for name in _COUNTERS},
+            # After the counters, whose entry it replaces: a resumed run starts its own count at 0.
             "restarts_before": self.restarts,
         }
 
@@ -146,14 +150,17 @@ class RunState:
         """
         state = checkpoint.load(path)
         check_compatible(path, state, self.cfg.env.name, self._layout(), self._models())
+
         for name, learner in self.setup.learners.items():
             learner.load_state_dict(state["learners"][name])
         if state["env"] is not None:
             self._restore_env(path, checkpoint.to_arrays(state["env"]))
+
         self.recent_episodes.load_state_dict(state["window"])
         self.matches.load_state_dict(state["matches"])
         for name in _COUNTERS:
             setattr(self, name, state[name])
+
         self.samples = state.get("samples", {})
         self._rng_state = state["rng"]
 

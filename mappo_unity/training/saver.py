@@ -87,6 +87,7 @@ class CheckpointSaver:
         steps, keep = complete["agent_steps"], self._cfg.keep_checkpoints
         self.last = checkpoint.save_in(self._folder, steps, complete, keep, best)
         self._saved_iteration = complete["iteration"]
+
         if best and self._exports is not None:
             self._exports.best_changed()
 

@@ -57,6 +57,7 @@ class TrainingSetup:
     def __init__(self, cfg: Config, env: UnityEnv) -> None:
         self.cfg, self.env = cfg, env
         self.notes = [f"note: {cfg.env.note}"] if cfg.env.note is not None else []
+
         self.rounds = batch_rounds(cfg.collect, env)
         self.learners = make_learners(cfg, env, self.rounds, self.notes.append)
         self.policy = JointPolicy({name: learner.actor for name, learner in self.learners.items()})
@@ -77,6 +78,7 @@ class TrainingSetup:
             batch: as collected.
             progress: share of the run that is over, 0 to 1, for the schedules.
         """
+        # Large minibatches gain from threads; small networks, while collecting, do not.
         torch.set_num_threads(min(self.cfg.update_threads, os.cpu_count() or 1))
         metrics = {
             name: learner.learn(entries_of(batch, name), progress) for name, learner in self.learners.items()
@@ -176,6 +178,7 @@ def make_learners(
     """
     check_behaviors(cfg, env.sides)
     check_batch_memory(cfg, env, rounds)
+
     learners = {}
     for name, sides in env.sides.items():
         model, ppo = behavior_config(cfg, name)
@@ -186,9 +189,12 @@ def make_learners(
         obs = ObsLayout.from_specs(behavior.spec.observation_specs)
         layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
         check_network_memory(name, obs, layout, team_size, model)
+
+        # Built after the check, so that what does not fit is refused by a line of ours.
         actor = make_actor(obs, layout, team_size, model).to(cfg.device)
         critic = make_critic(obs, team_size, model).to(cfg.device)
         learners[name] = PolicyLearner(actor, critic, ppo, rounds * teams, team_size)
+
     return learners
 
 
@@ -203,6 +209,7 @@ def check_minibatches(
             f"rounds x {teams} teams = {rows} team rows; lower ppo.num_minibatches, or raise "
             "collect.batch_size (or collect.rounds, where it is given)"
         )
+
     if ppo.num_minibatches is None and ppo.minibatch_size > rows * team_size:
         note(
             f"note: ppo.minibatch_size={ppo.minibatch_size} is larger than the batch of {name}: {rounds} "
@@ -228,6 +235,7 @@ def check_network_memory(
     """Raise ConfigError if a policy's networks do not fit into the memory that is free."""
     with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers
         nets = make_actor(obs, layout, team_size, cfg), make_critic(obs, team_size, cfg)
+
     size = sum(p.numel() * p.element_size() for net in nets for p in net.parameters())
     check_free(
         WEIGHT_COPIES * size,

@@ -65,6 +65,7 @@ class StopSignals:
         self._patience = threading.Timer(PATIENCE_S, _thread.interrupt_main, (number,))
         self._patience.daemon = True
         self._patience.start()
+
         self._say(
             f"stopping after this iteration, or in {PATIENCE_S:g} s with the one before it; "
             "once more to stop at once"

@@ -87,6 +87,7 @@ def run_sweep(lines: list[str], file: Path | None = None) -> SweepResult:
     plan = plan_jobs(lines, file, lambda text: print(text, flush=True))
     folder = _sweep_folder(lines, plan)
     result, patience = SweepResult(folder.path), SweepSignalHandler()
+
     try:
         with sweep_signals(patience, parallel=last_value(lines, "hydra/launcher") == "joblib"):
             _launch(
@@ -102,6 +103,7 @@ def run_sweep(lines: list[str], file: Path | None = None) -> SweepResult:
             _refuse_unstarted(folder, error)
             traceback.print_exc()
             result.error = f"{type(error).__name__}: {error}"
+
     result.signal = result.signal or patience.number
     result.jobs = _rank(_read_results(folder.path) + _missing(folder.path, plan.jobs))
     return result
@@ -122,11 +124,12 @@ def _run_job(tree: DictConfig) -> float | None:
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
     result = JobResult(int(hydra.job.num), [line.lstrip("+") for line in hydra.overrides.task], "failed")
-    print(
-        f"job {result.job}: {' '.join(result.overrides)}\n", end="", flush=True
-    )  # one write: jobs print side by side
+    # One write, its newline included: jobs print side by side.
+    print(f"job {result.job}: {' '.join(result.overrides)}\n", end="", flush=True)
+
     start_s = time.monotonic()
     ended_by: int | None = None
+
     try:
         with locked(folder):
             ended_by = _train(to_config(tree), folder, result)
@@ -137,8 +140,11 @@ def _run_job(tree: DictConfig) -> float | None:
         folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
         result.error = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
         (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
+
+    # Whatever became of the job: its result is there before a signal goes on to the sweep.
     result.wall_s = round(result.wall_s or time.monotonic() - start_s, 3)
     write_atomically(folder / RESULT, (json.dumps(asdict(result), indent=2) + "\n").encode())
+
     if ended_by is not None:
         raise Interrupted(ended_by)
     return result.return_mean
@@ -150,6 +156,7 @@ def varied_options(jobs: list[JobResult]) -> list[str]:
     for job in jobs:
         for key, value in job_options(job).items():
             values.setdefault(key, set()).add(value)
+
     return [key for key, seen in values.items() if len(seen) > 1]
 
 
@@ -169,6 +176,7 @@ def _train(config: Config, folder: Path, result: JobResult) -> int | None:
 
     with job_of_sweep(result.job, in_process_of_its_own()):
         outcome = train(config, folder)
+
     result.status = outcome.status
     mean = outcome.return_mean
     result.return_mean = mean if mean is not None and math.isfinite(mean) else None
@@ -189,6 +197,7 @@ def _refuse_unstarted(folder: NewFolder, error: Exception) -> None:
     """Raise ConfigError where a sweep broke off before its first job: its plugins refuse their options so."""
     if any(path.is_dir() for path in folder.path.iterdir()):
         return
+
     (folder.path / _GRID).unlink(missing_ok=True)
     discard_folder(folder)
     reason = " ".join(str(error).split()) or type(error).__name__
@@ -198,16 +207,17 @@ def _refuse_unstarted(folder: NewFolder, error: Exception) -> None:
 def _launch(lines: list[str], file: Path | None) -> None:
     if last_value(lines, "hydra/sweeper") == "optuna":
         _quieten()
+
+    # Hydra refuses to start where an earlier one of this process is left.
     GlobalHydra.instance().clear()
     search_path = create_config_search_path(str(conf_dir()))
     hydra = Hydra.create_main_hydra2("mappo-train", search_path)
     try:
         lines = [add_plus_prefix(line) for line in all_to_hydra_syntax(lines)]
         if all(last_value(lines, key) in (None, "basic") for key in ("hydra/sweeper", "hydra/launcher")):
-            lines = [
-                "hydra.sweeper.max_batch_size=1",
-                *lines,
-            ]  # Hydra composes a whole batch before its first job
+            # Hydra composes a whole batch before its first job.
+            lines = ["hydra.sweeper.max_batch_size=1", *lines]
+
         hydra.multirun(register_root(lines, file=file), run_job, lines)
     finally:
         GlobalHydra.instance().clear()
@@ -229,6 +239,7 @@ def _missing(folder: Path, planned: list[list[str]]) -> list[JobResult]:
     multirun = folder / _GRID
     if not multirun.is_file():  # a search writes none: nobody knows its jobs beforehand
         return []
+
     done = {job.job for job in _read_results(folder)}
     return [
         JobResult(number, [line.lstrip("+") for line in job], "no result")

@@ -36,12 +36,15 @@ class SweepSignalHandler:
             if time.monotonic() - self._since_s > DUPLICATE_SIGNAL_S:
                 raise Interrupted(self.number)
             return
+
         self.number, self._since_s = number, time.monotonic()
         print(
             f"waiting up to {GRACE_S:.0f} s for the jobs' checkpoints; once more to stop at once",
             file=sys.stderr,
             flush=True,
         )
+
+        # The timer sends this process the same signal again, which ends it as a second one does.
         if os.name == "posix":
             _hand_on(number)
             self._timer = threading.Timer(GRACE_S, os.kill, (os.getpid(), number))
@@ -125,11 +128,13 @@ def job_signals() -> Iterator[bool]:
 
     Raises Interrupted only in the process of the sweep: a launcher kills all others at the first exception.
     """
+    # Here jobs run in the process of the sweep: its own handlers are in charge.
     if _sweep is not None:
         if _sweep.number is not None:
             raise Interrupted(_sweep.number)
         yield True
         return
+
     _process.begin()
     try:
         yield _process.stopped_by is None

@@ -154,6 +154,7 @@ def _warn_rollback(name: str, metrics: dict[str, float], state: RunState, log: R
 
 def _outcome(status: str, state: RunState, saver: CheckpointSaver, stop: StopSignals) -> Outcome:
     diverged = any(2 * rolled_back > updates for rolled_back, updates in state.updates.values())
+    # Only a run that did all its steps is called diverged: any other end tells more.
     return Outcome(
         DIVERGED if status == FINISHED and diverged else status,
         stop.signal,

@@ -23,6 +23,7 @@ def smooth_edges(frame: np.ndarray) -> None:
     pixel = _pixels_at_edges(luma)
     if not pixel.size:
         return
+
     around = _Neighbours(luma, pixel)
     part = np.maximum(_part_by_place(luma.reshape(-1), pixel, around), _part_of_lone_pixels(around))
 
@@ -38,6 +39,7 @@ class _Neighbours:
         width = luma.shape[1]
         at = luma.reshape(-1).take
         up, down = pixel - width, pixel + width
+
         self.own = at(pixel)
         north, south, west, east = (at(place) for place in (up, down, pixel - 1, pixel + 1))
         corners = (at(up - 1), at(up + 1), at(down - 1), at(down + 1))
@@ -68,11 +70,16 @@ def _pixels_at_edges(luma: np.ndarray) -> np.ndarray:
     edge = np.zeros(luma.shape, bool)
     sideways = np.abs(luma[:, 1:] - luma[:, :-1]) > CONTRAST
     downwards = np.abs(luma[1:] - luma[:-1]) > CONTRAST
+
+    # Both pixels of a pair that differs are at the edge.
     edge[:, 1:] = sideways
     edge[:, :-1] |= sideways
     edge[1:] |= downwards
     edge[:-1] |= downwards
+
+    # The outermost pixels have no neighbours on all sides to be compared with.
     edge[[0, -1]] = edge[:, [0, -1]] = False
+
     return np.flatnonzero(edge)
 
 
@@ -101,15 +108,19 @@ def _walk(
     walked = np.full(pixel.size, REACH[-1], np.float32)
     change = np.zeros(pixel.size, np.int16)
     going = np.arange(pixel.size)
+
+    # All pixels walk at once; those that have reached the end of their step drop out.
     for distance in REACH:
         at = pixel[going] + distance * step[going]
         found = luma.take(at, mode="clip") + luma.take(at + across[going], mode="clip") - pair[going]
         change[going] = found
+
         ended = np.abs(found) >= limit[going]
         walked[going[ended]] = distance
         going = going[~ended]
         if not going.size:
             break
+
     return walked, change
 
 

@@ -67,6 +67,7 @@ class Tally:
         """Return goals, or the return of the running episode so far and that of the episode before."""
         if self.goals is not None:
             return [f"blue {self.goals[0]} : {self.goals[1]} purple"]
+
         so_far = [*self._ended, *self._shown()] or [0.0]
         before = [] if self._last is None else [f"last episode {_short(self._last)}"]
         return [f"return {_short(float(np.mean(so_far)))}", *before]

@@ -50,13 +50,16 @@ def play(cfg: PlayConfig) -> dict[str, Any]:
     video = Path(cfg.video) if cfg.video else None
     if video is not None:
         check_video(video, cfg.caption)
+
     torch.set_num_threads(1)
     torch.manual_seed(cfg.seed)
+
     scene = open_scene(cfg)
     try:
         policy = policy_of(cfg, scene)
         drawing = drawing_of(scene.NAME)
         pace = Pace(drawing, cfg.seconds)
+
         first, size = drawing.view(scene, 0), (cfg.width, cfg.height)
         if video is not None:
             with termination_as_interrupt(), VideoFile(video, first, size, pace.fps) as file:
@@ -66,6 +69,7 @@ def play(cfg: PlayConfig) -> dict[str, Any]:
                 figures = _roll(scene, policy, Projector(scene, drawing, pace, window, cfg.caption))
     finally:
         scene.close()
+
     return {"scene": scene.NAME, "policy": cfg.run or cfg.policy or RANDOM, "video": cfg.video} | figures
 
 
@@ -81,6 +85,7 @@ def policy_of(cfg: PlayConfig, scene: Scene) -> Policy:
     policy = open_policy(
         cfg.run or cfg.policy or RANDOM, cfg.deterministic, cfg.seed, "run" if cfg.run else "policy"
     )
+
     for name, spec in scene.behavior_specs.items():
         policy.check(name, spec)
     return policy
@@ -102,6 +107,7 @@ class Projector:
         self.scene, self.drawing, self.pace, self.screen = scene, drawing, pace, screen
         self.ticks = self.frames = 0
         self.over = False
+
         followed = int(scene.agents.agent_id[0]) if isinstance(drawing.camera, Follow) else None
         self.tally = Tally(drawing.goals, followed)
         self._camera = MovingCamera(scene, drawing, 1 / pace.fps)
@@ -110,11 +116,14 @@ class Projector:
     def tick(self) -> None:
         """Show the scene if a frame is due."""
         self.ticks += 1
+        # A step of the scene has several ticks: the video may be over before it ends.
         if self.over or self.ticks % self.pace.ticks:
             return
+
         time = f"{self.ticks * self.drawing.tick_s:.1f} s"
         caption = [self.scene.NAME, time, *self.tally.score()] if self._caption else []
         wanted = self.screen.show(self.drawing.shapes(self.scene, 0), self._camera.view(), caption)
+
         self.frames += 1
         self.over = not wanted or self.frames >= self.pace.frames
 
@@ -123,6 +132,8 @@ def _roll(scene: Scene, policy: Policy, projector: Projector) -> dict[str, Any]:
     """Play until the video is over."""
     scene.after_tick = projector.tick
     scene.reset()
+
+    # Frames are shown by `tick`, from within the steps of the scene.
     while not projector.over:
         steps = {name: scene.get_steps(name) for name in scene.behavior_specs}
         for name, begun in projector.tally.add(steps).items():
@@ -131,6 +142,7 @@ def _roll(scene: Scene, policy: Policy, projector: Projector) -> dict[str, Any]:
             if len(decisions):
                 scene.set_actions(name, policy.act(name, decisions, spec))
         scene.step()
+
     returns = projector.tally.returns
     return {
         "seconds": projector.frames / projector.pace.fps,

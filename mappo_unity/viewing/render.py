@@ -76,6 +76,8 @@ class Renderer:
         self._context.make_current()
         mujoco.mjr_render(self._rectangle, self._stage.fill(shapes, camera), self._gl)
         mujoco.mjr_readPixels(self._pixels, None, self._rectangle, self._gl)
+
+        # OpenGL's first row is the lowest one.
         frame = np.ascontiguousarray(self._pixels[::-1])
         smooth_edges(frame)
         return frame
@@ -100,9 +102,11 @@ class Stage:
             center=center,
             light=" ".join(f"{part:g}" for part in _LIGHT),
         )
+
         self.model: mujoco.MjModel = mujoco.MjModel.from_xml_string(text)
         self._data = mujoco.MjData(self.model)
         mujoco.mj_forward(self.model, self._data)
+
         self._scene = mujoco.MjvScene(self.model, MAX_SHAPES)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True
         self._option = mujoco.MjvOption()
@@ -112,10 +116,14 @@ class Stage:
         """Put the shapes into the renderer's list and point the camera."""
         if len(shapes) > MAX_SHAPES:
             raise ValueError(f"{len(shapes)} shapes are more than the renderer's {MAX_SHAPES}")
+
+        # Unity's yaw is clockwise from forward, which is MuJoCo's y; azimuth is the other way round from x.
         self._camera.lookat[:] = np.array(camera.target)[_SWAP]
         self._camera.distance = camera.distance
         self._camera.azimuth = 90.0 - camera.yaw
         self._camera.elevation = -camera.pitch
+
+        # This empties the list of shapes and sets the lights anew: ours come afterwards.
         scene = self._scene
         mujoco.mjv_updateScene(
             self.model,
@@ -126,10 +134,12 @@ class Stage:
             mujoco.mjtCatBit.mjCAT_ALL.value,
             scene,
         )
+
         self._place_light()
         for shape in shapes:
             _put(scene.geoms[scene.ngeom], shape)
             scene.ngeom += 1
+
         return scene
 
     def _place_light(self) -> None:
@@ -150,6 +160,7 @@ def _put(geom: Any, shape: Shape) -> None:
         size[:] = np.array(shape.size)[_SWAP]
     else:
         size[:2] = shape.size
+
     mujoco.mjv_initGeom(
         geom,
         int(_KINDS[shape.kind]),
@@ -158,6 +169,7 @@ def _put(geom: Any, shape: Shape) -> None:
         shape.rotation[_SWAP][:, _SWAP].reshape(-1),
         np.array(shape.color, np.float32),
     )
+
     category = mujoco.mjtCatBit.mjCAT_DYNAMIC if shape.shadow else mujoco.mjtCatBit.mjCAT_DECOR
     geom.category = int(category)
     geom.specular, geom.shininess = 0.2, 0.4
@@ -173,6 +185,7 @@ def _offscreen_context(width: int, height: int) -> Any:
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip() or _installed()
     if wanted not in ("egl", "osmesa"):
         wanted = "glfw"  # the only one left, whatever name MuJoCo takes it by
+
     try:
         if wanted == "egl":
             from mujoco.egl import GLContext
@@ -181,6 +194,7 @@ def _offscreen_context(width: int, height: int) -> Any:
         else:
             _start_glfw()
             from mujoco.glfw import GLContext
+
         return GLContext(width, height)
     except Exception as error:  # PyOpenGL and the drivers raise many kinds
         raise ConfigError(
@@ -201,7 +215,10 @@ def _start_glfw() -> None:
 def _installed() -> str:
     if sys.platform != "linux":
         return "glfw"
+
     for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
         if ctypes.util.find_library(library):
             return name
+
+    # Neither was found: if EGL does not work either, the error names the packages.
     return "egl"

@@ -14,6 +14,7 @@ from mappo_unity.scenes.mujoco_check import check_mujoco
 def check_screen(cfg: PlayConfig) -> None:
     """Raise ConfigError if the video cannot be written or drawn, or no window can be opened."""
     check_mujoco()
+
     if cfg.video is None:
         from mappo_unity.viewing.window import check_display
 

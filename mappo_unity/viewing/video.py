@@ -63,6 +63,8 @@ class VideoFile:
 
     def __enter__(self) -> VideoFile:
         kind = GifWriter if self._path.suffix == ".gif" else Mp4Writer
+
+        # What fails here undoes what was done before it; once all is open, `__exit__` does.
         with ExitStack() as stack:
             stack.callback(self._renderer.close)
             with _told(self._path):
@@ -71,6 +73,7 @@ class VideoFile:
                 self._writer: GifWriter | Mp4Writer = kind(self._part, self._size, self._fps)
             stack.callback(self._writer.stop)
             self._stack = stack.pop_all()
+
         return self
 
     def __exit__(
@@ -101,6 +104,7 @@ class GifWriter:
         """Write the file; raises OSError."""
         ends = [round(100 * number / self._fps) for number in range(len(self._frames) + 1)]
         durations_ms = [10 * (end - start) for start, end in zip(ends, ends[1:])]
+
         first, *rest = self._frames
         with self._path.open("wb") as file:
             first.save(file, "GIF", save_all=True, append_images=rest, duration=durations_ms, loop=0)
@@ -117,9 +121,11 @@ class Mp4Writer:
 
     def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:
         program = importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
+
         rate = Fraction(fps).limit_denominator(1001)
         source = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {rate} -i -"
         target = "-an -c:v libx264 -preset veryfast -pix_fmt yuv420p -crf 15 -f mp4"
+
         self._process = subprocess.Popen(
             [program, "-y", "-v", "error", "-xerror", *source.split(), *target.split(), str(path.absolute())],
             stdin=subprocess.PIPE,
@@ -133,6 +139,7 @@ class Mp4Writer:
         try:
             self._process.stdin.write(frame.tobytes())
         except BrokenPipeError:
+            # Where ffmpeg ended with an error, this raises its own reason.
             self.finish()
             raise OSError("ffmpeg ended before the video was complete") from None
 
@@ -154,12 +161,14 @@ def check_video(path: Path, caption: bool = False) -> None:
     """Raise ConfigError if no video, with a caption where that is wanted, can be written to `path`."""
     if path.suffix not in SUFFIXES:
         raise ConfigError(f"video={path} must end in one of: {', '.join(SUFFIXES)}")
+
     with _told(path):
         writable = path.parent.is_dir() and os.access(path.parent, os.W_OK) and not path.is_dir()
     if not writable:
         raise ConfigError(
             f"video={path} cannot be written: {path.parent} must be a folder that can be written"
         )
+
     _check_package(f"video={path}", "imageio_ffmpeg" if path.suffix == ".mp4" else "PIL")
     if caption:
         _check_package("caption=true", "PIL")

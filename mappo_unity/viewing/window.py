@@ -25,6 +25,7 @@ def check_display() -> None:
     """Start the library of windows; raise ConfigError if there is no display, or none that it can use."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigError("there is no display for a window here; video=FILE.mp4 or .gif writes a video")
+
     import glfw
 
     glfw.ERROR_REPORTING = "ignore"  # no warnings beside our message
@@ -50,15 +51,19 @@ class Window:
         import glfw
 
         self._glfw: Any = glfw
+        # Four samples a pixel; hints count only for windows that are made after them.
         glfw.window_hint(glfw.SAMPLES, 4)
         self._window: Any = glfw.create_window(*size, title, None, None)
         if not self._window:
             glfw.terminate()
             raise ConfigError(NO_WINDOW)
+
+        # MuJoCo puts its pictures and shapes into the context that is current: first this, then its own.
         glfw.make_context_current(self._window)
         self._stage = Stage(camera, *size)
         self._context = mujoco.MjrContext(self._stage.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_WINDOW.value, self._context)
+
         self._frame_s = 1.0 / fps
         self._due = time.monotonic()
 
@@ -69,8 +74,11 @@ class Window:
         if caption:
             font, corner = mujoco.mjtFont.mjFONT_NORMAL.value, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT.value
             mujoco.mjr_overlay(font, corner, area, "    ".join(caption), "", self._context)
+
+        # After a stall the pace goes on from now, at most one frame behind: nothing is rushed through.
         self._due = max(self._due + self._frame_s, time.monotonic() - self._frame_s)
         time.sleep(max(0.0, self._due - time.monotonic()))
+
         self._glfw.swap_buffers(self._window)
         self._glfw.poll_events()
         return not self._glfw.window_should_close(self._window)
