@@ -31,7 +31,7 @@ def targets(physics: FoodPhysics, yaw: np.ndarray, shooting: np.ndarray) -> np.n
 
     offset = physics.agent_position[:, area] - start[:, :, None]
     travel = _to_boxes(offset, physics.agent_half[area], yaw[area], ahead)
-    # Nobody meets the own laser.
+    # No shot meets its shooter.
     travel[np.arange(area.size), shooter] = np.inf
 
     nearest = travel.argmin(axis=1)
@@ -40,7 +40,7 @@ def targets(physics: FoodPhysics, yaw: np.ndarray, shooting: np.ndarray) -> np.n
     if not meets.size:
         return hit
 
-    # Only shots that reach an agent can be blocked.
+    # Balls and walls matter only to shots that reach an agent.
     start, ahead, balls = start[:, meets], ahead[:, meets], physics.ball_position[:, area[meets]]
     blocked = np.minimum(_to_balls(balls - start[:, :, None], ahead), _to_walls(start, ahead))
     meets = meets[travel[meets] <= blocked]

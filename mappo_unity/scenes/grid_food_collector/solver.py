@@ -62,7 +62,7 @@ class Solver:
         if not one.size:
             return lift
 
-        # A body in k contacts counts as k times as light: together they push no more than one.
+        # In k contacts a body counts as k times as light, so that their impulses cannot add up to too much.
         share = np.bincount(one, minlength=velocity.shape[1])
         share += np.bincount(other, minlength=velocity.shape[1])
         mobility = self.inverse_mass * share
