@@ -38,17 +38,20 @@ def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapp
             pass.
     """
     check_call(factory, name, params)
+
     try:
         env = factory(seed=seed, **params)
     except (ConfigError, EnvironmentFailure):
         raise
     except (Exception, SystemExit) as error:
         raise explain_error(error, name) from error
+
     if not isinstance(env, BaseEnv):
         raise ConfigError(
             f"{name} returned {with_article(type(env).__name__)}; it must return a "
             "mlagents_envs.base_env.BaseEnv"
         )
+
     return env
 
 
@@ -58,6 +61,7 @@ def check_call(factory: Callable[..., Any], name: str, params: Mapping[str, Any]
         signature = inspect.signature(factory)
     except (TypeError, ValueError):
         return  # a builtin without one
+
     try:
         signature.bind(seed=0, **params)
     except TypeError as error:
@@ -71,6 +75,7 @@ def load_factory(path: str, name: str) -> Callable[..., Any]:
     """Return the function that package.module:function names; raises ConfigError, which calls it `name`."""
     module_name, _, function_name = path.partition(":")
     add_working_directory()
+
     try:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # the user's module raises what it likes
@@ -82,8 +87,10 @@ def load_factory(path: str, name: str) -> Callable[..., Any]:
     if function is not None:
         kind = with_article(type(function).__name__)
         raise ConfigError(f"{name}: {function_name} is {kind}, but must be a function that returns a BaseEnv")
+
     names = sorted(n for n, value in vars(module).items() if _is_own_function(value, module_name))
     more = ", ..." if len(names) > 20 else ""
+
     raise ConfigError(
         f"{name}: {module_name} has no function {function_name!r}{did_you_mean(function_name, names)}; "
         f"it has {', '.join(names[:20]) or 'none'}{more}"
@@ -102,11 +109,14 @@ def explain_error(error: BaseException, who: str) -> ConfigError:
     mistake = ConfigError(
         f"{who} raised {type(error).__name__}" + (f": {' '.join(text.split())}" if text else "")
     )
+
+    # Errors that this one came from show only the user's frames, too.
     report = TracebackException.from_exception(error)
     part: TracebackException | None = report
     while part is not None:
         part.stack[:] = [frame for frame in part.stack if not frame.filename.startswith(OUR_FRAMES)]
         part = part.__cause__ or part.__context__
+
     mistake.details = tuple("".join(report.format()).splitlines())
     return mistake
 

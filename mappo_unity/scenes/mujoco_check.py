@@ -16,6 +16,7 @@ def check_mujoco() -> None:
     choice = os.environ.get("MUJOCO_GL", "").strip()
     if not choice:
         return
+
     try:
         importlib.import_module("mujoco")
     except Exception as error:  # PyOpenGL raises many kinds where a library is missing

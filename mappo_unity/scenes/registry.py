@@ -87,10 +87,12 @@ def make_scene(name: str, seed: int = 0, **params: Any) -> Scene:
     record = find_record(name)
     if record is None:
         raise ConfigError(f"there is no embedded scene {name!r}; choices: {', '.join(scene_names())}")
+
     scene_class: type[Scene] = _load(record.scene, record)
     if record.package is None:
         return scene_class(seed=seed, **params)
 
+    # A package's scene is called like a user's factory: what it raises is told as the package's.
     from mappo_unity.scenes.factory import call_factory
 
     _check_class(scene_class, record)
@@ -107,9 +109,11 @@ def drawing_of(name: str) -> Drawing:
         raise ConfigError(f"there is no drawing of a scene {name!r}; choices: {', '.join(scene_names())}")
     if record.drawing is None:
         raise ConfigError(f"there is no drawing of the {_who(record)}: its record names none")
+
     drawing = _load(record.drawing, record)
     if not isinstance(drawing, Drawing):
         raise ConfigError(f"{_who(record)}: {record.drawing} is {drawing!r}, but must be a Drawing")
+
     return drawing
 
 
@@ -137,12 +141,14 @@ def find_record(name: str) -> SceneRecord | None:
             f"there are {len(owners)} scenes {name!r}, of {' and '.join(owners)}: uninstall one, or give it "
             f"another name among the entry points of the group {GROUP}"
         )
+
     if not entries:
         return BUILT_IN.get(name)
 
     entry = entries[0]
     path = f"{entry.module}:{entry.attr}"
     record = SceneRecord(name, path, package=packages[0])
+    # A package names a class, or a record that says more than where the class is.
     named = _load(path, record)
     return replace(named, name=name, package=packages[0]) if isinstance(named, SceneRecord) else record
 
@@ -160,6 +166,7 @@ def _entry_points(path: tuple[str, ...]) -> dict[str, list[EntryPoint]]:
     found: dict[str, list[EntryPoint]] = {}
     for entry in entry_points(group=GROUP):
         found.setdefault(entry.name, []).append(entry)
+
     return found
 
 
@@ -173,6 +180,7 @@ def _check_class(scene_class: Any, record: SceneRecord) -> None:
             f"{who} is {scene_class!r}, but must be a SceneRecord or a subclass of "
             "mappo_unity.scenes.core.scene.Scene"
         )
+
     own = getattr(scene_class, "NAME", None)
     if own != record.name:
         raise ConfigError(f"{who} has NAME = {own!r}; it must be {record.name!r}, the entry point's name")
@@ -197,4 +205,5 @@ def _load(path: str, record: SceneRecord) -> Any:
             from mappo_unity.scenes.factory import explain_error
 
             raise explain_error(error, f"{_who(record)}: {path} cannot be loaded: it") from error
+
     return value

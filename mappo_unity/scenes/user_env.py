@@ -36,9 +36,11 @@ class GuardedEnv(BaseEnv):
     def __getattr__(self, attribute: str) -> Any:
         if attribute == "_env":  # not there yet, in a copy that is being made
             raise AttributeError(attribute)
+
         value = getattr(self._env, attribute)
         if attribute in ("get_state", "set_state"):
             return lambda *arguments: self._call(attribute, value, *arguments)
+
         return value
 
     @property
@@ -84,6 +86,7 @@ class GuardedEnv(BaseEnv):
             mistake = self._explain(error, f"{self._name}: its {method}")
             if not self._has_stepped:
                 raise mistake from error
+
             failure = EnvironmentFailure(str(mistake))
             failure.details = mistake.details
             raise failure from error

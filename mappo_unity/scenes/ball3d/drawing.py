@@ -23,9 +23,11 @@ def shapes(scene: Ball3D, area: int) -> list[Shape]:
     """Return the cube, its eyes, which look at the camera, and the ball."""
     turn = quaternion_rotation(scene.cube_rotation[area])
     drawn = [box((0, 0, 0), (CUBE_HALF,) * 3, BLUE, turn)]
+
     for side in (-1, 1):
         drawn.append(ball(turn @ np.array([side * 1.0, 0.9, -CUBE_HALF]), 0.55, WHITE))
         drawn.append(ball(turn @ np.array([side * 1.0, 1.0, -CUBE_HALF - 0.32]), 0.32, DARK))
+
     mouth = turn @ np.array([0.0, -0.9, -CUBE_HALF])
     drawn.append(box(mouth, (0.8, 0.12, 0.06), DARK, turn))
     drawn.append(ball(scene.ball_position[area], BALL_RADIUS * float(scene.scale[area]), ORANGE))

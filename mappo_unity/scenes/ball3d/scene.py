@@ -75,13 +75,17 @@ class Ball3D(Scene):
             areas_per_model=AREAS_PER_MODEL,
         )
         self.physics.set_gravity(self.parameters["gravity"])
+
+        # Views of the physics' arrays: what is written here moves the ball.
         self.ball_position = self.physics.qpos[:, 0:3]  # relative to the cube, which stands at the origin
         self.ball_velocity = self.physics.qvel[:, 0:3]
         self.ball_spin = self.physics.qvel[:, 3:6]
         self.cube_rotation = self.physics.mocap_quat[:, 0]  # w, x, y, z; written by set_cubes
+
         self._matrix = matrices(self.cube_rotation.T)  # [3, 3, N], after this tick's turn
         self._before = np.zeros((3, self.num_areas))  # the ball in the cube's frame before the turn
         self._turned = np.zeros(self.num_areas, bool)  # whether `_before` belongs to this episode
+
         self.mass = np.ones(self.num_areas)  # kg, in force since the area's last reset
         self.scale = np.ones(self.num_areas)
 
@@ -91,9 +95,11 @@ class Ball3D(Scene):
         flat = np.zeros((4, len(slots)))
         flat[0] = 1
         self.set_cubes(slots, turned(turned(flat, "x", tilt[:, 0]), "z", tilt[:, 1]))
+
         self.ball_position[slots, 1] = 4
         self.ball_position[slots[:, None], [0, 2]] = self.rng.uniform(-1.5, 1.5, (len(slots), 2))
         self.ball_velocity[slots] = 0  # the spin is kept
+
         self._turned[slots] = False
         self._read_parameters(slots)
 
@@ -112,12 +118,16 @@ class Ball3D(Scene):
         angle = np.minimum(np.maximum(self.agents.continuous.T, -1.0), 1.0) * TURN_RAD
         self._before = in_cube(self._matrix, self.ball_position.T)
         self._turned[:] = True
+
+        # Its own axes: the second turn is about an axis that the first one has moved.
         rotation = limited_turn(self.cube_rotation.T, "z", angle[0])
         rotation = limited_turn(rotation, "x", angle[1])
         self.cube_rotation[...] = rotation.T
         self._matrix = matrices(rotation)
+
         x, y, z = self.ball_position.T
         fallen = (y < -2) | (np.abs(x) > 3) | (np.abs(z) > 3)
+
         self.agents.reward[:] = 0.1
         if fallen.any():
             self.set_reward(fallen, -1.0)
@@ -130,6 +140,7 @@ class Ball3D(Scene):
         fast = np.einsum("ni,ni->n", spin, spin) > MAX_SPIN**2
         if fast.any():
             spin[fast] *= MAX_SPIN / np.linalg.norm(spin[fast], axis=1, keepdims=True)
+
         self._move_with_cube()
         self.physics.step()
 
@@ -152,6 +163,8 @@ class Ball3D(Scene):
         self.physics.set_gravity(self.parameters["gravity"])
         self.physics.set_state(state["physics"])
         self._matrix = matrices(self.cube_rotation.T)
+
+        # Masses and sizes are the engine's constants: only what differs is written.
         changed = np.flatnonzero((self.mass != state["mass"]) | (self.scale != state["scale"]))
         self.mass[:], self.scale[:] = state["mass"], state["scale"]
         self._set_balls(changed)
@@ -168,13 +181,17 @@ class Ball3D(Scene):
         offset = local - np.minimum(np.maximum(local, -CUBE_HALF), CUBE_HALF)  # from its nearest point
         distance = np.sqrt(np.einsum("in,in->n", offset, offset))
         depth = BALL_RADIUS * self.scale - distance
+
         touching = depth > -TOUCH_GAP
         if not touching.any():
             return
+
         normal = offset / np.maximum(distance, CONTACT_SLACK)  # zero inside the cube: no direction out
         push = np.minimum(np.maximum(PUSH_OUT * (depth - CONTACT_SLACK), 0), MAX_PUSH_OUT)
         slip = (self._before - local) * (ROLLING_SHARE * (touching & self._turned & (distance > 0)))
+        # Along the normal only the push counts, so the slip's part along it is taken out.
         shift = slip + normal * (push - np.einsum("in,in->n", slip, normal))
+
         self.ball_position += np.einsum("ijn,jn->ni", self._matrix, shift)
 
     def _read_parameters(self, slots: np.ndarray) -> None:
@@ -189,11 +206,15 @@ class Ball3D(Scene):
             model, prefix = self.physics.own_model(area)
             body, geom = model.body(f"{prefix}ball"), model.geom(f"{prefix}ball")
             radius = BALL_RADIUS * self.scale[area]
+
+            # The engine keeps three sizes of a geom: its own, its bounding sphere and its box.
             geom.size[0] = radius
             geom.rbound[0] = radius
             model.geom_aabb[geom.id, 3:] = radius
+
             body.mass[0] = self.mass[area]
             body.inertia[:] = 0.4 * self.mass[area] * radius**2  # solid sphere
+
             self.physics.constants_changed(area)
 
 
@@ -206,11 +227,13 @@ def turned(rotation: np.ndarray, axis: str, angle: np.ndarray) -> np.ndarray:
     half = 0.5 * angle
     s, c = np.sin(half), np.cos(half)
     out = np.empty(rotation.shape)
+
     if axis == "x":
         out[0], out[1], out[2], out[3] = w * c - x * s, x * c + w * s, y * c + z * s, z * c - y * s
     else:
         assert axis == "z"
         out[0], out[1], out[2], out[3] = w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s
+
     return out
 
 
@@ -220,10 +243,12 @@ def matrices(rotation: np.ndarray) -> np.ndarray:
     xx, yy, zz = 2 * rotation[1:] * rotation[1:]
     wx, wy, wz = 2 * w * rotation[1:]
     xy, xz, yz = 2 * x * y, 2 * x * z, 2 * y * z
+
     out = np.empty((3, 3, rotation.shape[1]))
     out[0, 0], out[0, 1], out[0, 2] = 1 - yy - zz, xy - wz, xz + wy
     out[1, 0], out[1, 1], out[1, 2] = xy + wz, 1 - xx - zz, yz - wx
     out[2, 0], out[2, 1], out[2, 2] = xz - wy, yz + wx, 1 - xx - yy
+
     return out
 
 

@@ -58,9 +58,11 @@ def _check_env(env: Any, steps: int, seed: int, remake: Callable[[], BaseEnv] | 
     env.reset()
     _check_shown(env.behavior_specs)
     _check_errors(env)
+
     play(env, steps, rng, report)
     require(report.decisions > 0, f"no agent asked for a decision in {steps} steps")
 
+    # A reset in the midst of episodes must leave records that fit, too.
     env.reset()
     play(env, max(1, steps // 10), rng, report)
     report.checks += ["specs", "records", "errors", "reset"]
@@ -69,12 +71,15 @@ def _check_env(env: Any, steps: int, seed: int, remake: Callable[[], BaseEnv] | 
     require(
         snapshots[0] == snapshots[1], "of get_state and set_state there is only one: give both, or neither"
     )
+
     if all(snapshots):
         _check_snapshot(env, max(1, steps // 4), seed)
         report.checks.append("get_state/set_state")
+
     if remake is not None:
         _check_determinism(remake, max(1, steps // 4), seed)
         report.checks.append("seed")
+
     return report
 
 
@@ -95,6 +100,7 @@ def _check_shown(specs: Any) -> None:
     """Check what behaviors say of themselves, also what no trainer needs."""
     check_specs(specs)
     require(len(specs) > 0, "after reset() there is no behavior: behavior_specs is empty")
+
     for name, spec in specs.items():
         names = [sensor.name for sensor in spec.observation_specs]
         require(len(set(names)) == len(names), f"{name}: sensor names repeat: {names}")
@@ -109,15 +115,20 @@ def _check_errors(env: Any) -> None:
     """Check that wrong names, wrong shapes and agents that did not ask are refused."""
     name, spec = next(iter(env.behavior_specs.items()))
     decisions, _ = RecordCheck(name, spec)(env.get_steps(name))
+
     missing = int(max(decisions.agent_id, default=0)) + 10_000
     wrong = spec.action_spec.empty_action(len(decisions) + 1)
     _require_raises(f"set_actions({name!r}) with a row too many", lambda: env.set_actions(name, wrong))
+
     one = spec.action_spec.empty_action(1)
     _require_raises(
         f"set_action_for_agent({name!r}, {missing}), which did not ask",
         lambda: env.set_action_for_agent(name, missing, one),
     )
+
     _require_raises("get_steps of an unknown behavior", lambda: env.get_steps("no such behavior"))
+
+    # After all refusals an agent that did ask is still served.
     if len(decisions):
         env.set_action_for_agent(name, int(decisions.agent_id[0]), one)
 
@@ -125,10 +136,12 @@ def _check_errors(env: Any) -> None:
 def _check_snapshot(env: Any, steps: int, seed: int) -> None:
     state = env.get_state()
     check_plain(state, "get_state()")
+
     traces = []
     for _ in range(2):
         env.set_state(state)
         traces.append(play(env, steps, np.random.default_rng(seed), Report()))
+
     _require_equal(traces[0], traces[1], "after set_state() the same actions give other records")
 
 
@@ -140,6 +153,7 @@ def _check_determinism(remake: Callable[[], BaseEnv], steps: int, seed: int) -> 
         env.reset()
         traces.append(play(env, steps, np.random.default_rng(seed), Report()))
         check_close(made)
+
     _require_equal(traces[0], traces[1], "the same seed and actions give other records")
 
 
@@ -153,16 +167,19 @@ def _require_raises(what: str, call: Callable[[], Any]) -> None:
         call()
     except Exception:
         return
+
     raise ContractError(f"{what} is accepted, but must be refused (UnityActionException or any other error)")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Check a scene or a user's environment; return 0 if it keeps the contract, 1 if not, 2 for a mistake."""
     options = _parser().parse_intermixed_args(arguments)
+
     try:
         make = _maker(options)
         env = make()
         report = check_env(env, options.steps, options.seed, remake=None if options.any_seed else make)
+        # Before the close: a closed environment need not show its behaviors.
         lines = _describe(env)
         check_close(env)
     except ContractError as error:
@@ -171,6 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
     except ConfigError as error:
         print(f"{options.scene}: {error}", *error.details, sep="\n", file=sys.stderr)
         return 2
+
     print(*lines, _summary(options.scene, report), sep="\n")
     return 0
 
@@ -180,10 +198,13 @@ def _maker(options: argparse.Namespace) -> Callable[[], BaseEnv]:
     check_range("--steps", options.steps, 1)
     check_range("--seed", options.seed, 0)
     params = _params(options.params)
+
     if ":" not in options.scene:
         return lambda: make_scene(options.scene, seed=options.seed, num_areas=options.num_areas, **params)
+
     if options.num_areas is not None:
         raise ConfigError("--num-areas is for scenes; give what a factory takes as env.params.NAME=VALUE")
+
     factory = load_factory(options.scene, options.scene)
     return lambda: call_factory(factory, options.scene, options.seed, params)
 
@@ -197,6 +218,8 @@ def _params(lines: list[str]) -> dict[str, Any]:
             raise ConfigError(f"{line} is not of the form env.params.NAME=VALUE")
     if not lines:
         return {}
+
+    # The factory is a stand-in that nobody loads: only the parameters are read.
     return dict(compose_config(["env=custom", "env.factory=any:one", *lines]).config.env.params)
 
 
@@ -206,6 +229,7 @@ def _describe(env: BaseEnv) -> list[str]:
     for name, spec in env.behavior_specs.items():
         sensors = ", ".join(f"{sensor.name} {tuple(sensor.shape)}" for sensor in spec.observation_specs)
         lines.append(f"behavior {name}: observations {sensors}; actions: {spec.action_spec}")
+
     return lines
 
 
@@ -223,17 +247,20 @@ def _parser() -> argparse.ArgumentParser:
         description="Play an environment with random actions and check what it sends against the rules of "
         "mlagents_envs' BaseEnv.",
     )
+
     parser.add_argument(
         "scene",
         metavar="ENVIRONMENT",
         help=f"package.module:function, or a scene: {', '.join(scene_names())}",
     )
+
     parser.add_argument(
         "params",
         nargs="*",
         metavar="env.params.NAME=VALUE",
         help="what it is made with, as mappo-train takes it",
     )
+
     parser.add_argument("--steps", type=int, default=500, help="environment steps to play; default 500")
     parser.add_argument("--num-areas", type=int, default=None, help="copies of a scene's area")
     parser.add_argument(
@@ -242,6 +269,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--any-seed", action="store_true", help="the same seed need not give the same records"
     )
+
     return parser
 
 

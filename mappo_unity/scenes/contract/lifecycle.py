@@ -36,8 +36,10 @@ class Lives:
         for agent, group_id in zip(steps.agent_id.tolist(), steps.group_id.tolist(), strict=True):
             known = self._agents.get(agent)
             if known is None:
+                # It ended before it ever asked.
                 self._agents[agent] = _Agent(name, group_id, ended=True)
                 continue
+
             require(
                 not known.ended, f"{name}, agent {agent}: two terminal records without a decision between"
             )
@@ -50,6 +52,7 @@ class Lives:
                 f"{name}, agent {agent}: ended in group {group_id}, but its decisions were in "
                 f"{known.group_id}",
             )
+
             known.ended = True
 
     def ask(self, name: str, steps: DecisionSteps) -> None:
@@ -61,12 +64,14 @@ class Lives:
                 f"{self._asked.get(agent)}",
             )
             self._asked[agent] = name
+
             known = self._agents.get(agent)
             if known is not None and not known.ended:
                 require(
                     known.behavior == name,
                     f"{name}, agent {agent}: came from {known.behavior} without a terminal record",
                 )
+
             self._agents[agent] = _Agent(name, group_id)
 
 

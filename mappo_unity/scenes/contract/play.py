@@ -37,17 +37,20 @@ def play(env: Any, steps: int, rng: np.random.Generator, report: Report) -> Trac
     lives = Lives()
     specs = dict(env.behavior_specs)
     checks = {name: RecordCheck(name, spec) for name, spec in specs.items()}
+
     for step in range(steps):
         num_decisions = num_terminals = 0
         check_same_specs(env.behavior_specs, specs)
         records = {name: _checked(checks[name], env.get_steps(name)) for name in specs}
         lives.begin_result()
 
+        # All ends first: an agent may end and ask again in one result.
         for name, (_, terminals) in records.items():
             lives.end(name, terminals)
             num_terminals += len(terminals)
             report.interrupted += int(terminals.interrupted.sum())
             trace += _arrays(f"step {step}, {name}", terminals)
+
         for name, (decisions, _) in records.items():
             lives.ask(name, decisions)
             num_decisions += len(decisions)
@@ -60,18 +63,23 @@ def play(env: Any, steps: int, rng: np.random.Generator, report: Report) -> Trac
             f"{'step' if step else 'reset'}() returned without any record: it must go on until some agent "
             "asks for a decision or ends",
         )
+
         report.steps += 1
         report.decisions += num_decisions
         report.terminals += num_terminals
         report.terminal_only_steps += num_decisions == 0
+
         env.step()
+
     return trace
 
 
 def _checked(check: RecordCheck, result: Any) -> tuple[DecisionSteps, TerminalSteps]:
     """Check a result more strictly than who only reads it: also the types, and the shapes of empty arrays."""
     check(result)
+
     for steps in result:
+        # Only for what it refuses: what it converts is not used here.
         Repair(check.name, check.spec, steps).converted()
         kind = "DecisionSteps" if isinstance(steps, DecisionSteps) else "TerminalSteps"
         for label, values in _arrays("", steps):
@@ -80,8 +88,10 @@ def _checked(check: RecordCheck, result: Any) -> tuple[DecisionSteps, TerminalSt
                 wanted is None or values.dtype == wanted,
                 f"{check.name}: {kind} {label.split()[-1]} dtype {values.dtype}, not {wanted}",
             )
+
         for mask in getattr(steps, "action_mask", None) or []:
             require(mask.dtype == bool, f"{check.name}: action mask dtype {mask.dtype}, not bool")
+
     return result[0], result[1]
 
 
@@ -110,6 +120,7 @@ def random_actions(
     count = len(decisions)
     continuous = rng.uniform(-1, 1, (count, spec.action_spec.continuous_size)).astype(np.float32)
     discrete = np.zeros((count, spec.action_spec.discrete_size), np.int32)
+
     for branch, size in enumerate(spec.action_spec.discrete_branches):
         score = rng.random((count, size))
         if decisions.action_mask is not None:
@@ -117,6 +128,8 @@ def random_actions(
             for row in np.flatnonzero(forbidden.all(axis=1)):
                 agent = int(decisions.agent_id[row])
                 raise ContractError(f"{name}, agent {agent}: every action of branch {branch} is forbidden")
+            # Below the score of every allowed action.
             score = np.where(forbidden, -1.0, score)
         discrete[:, branch] = score.argmax(axis=1)
+
     return ActionTuple(continuous, discrete)

@@ -51,6 +51,7 @@ class RecordCheck:
                 "(DecisionSteps, TerminalSteps), for no agents DecisionSteps.empty(spec) and "
                 "TerminalSteps.empty(spec)"
             )
+
         return self._checked(result[0]), self._checked(result[1])
 
     def _checked(self, steps: Any) -> Any:
@@ -76,6 +77,7 @@ class RecordCheck:
             return False
         if not (ids.dtype.kind == groups.dtype.kind == "i" and reward.dtype == group_reward.dtype == FLOAT32):
             return False
+
         if isinstance(steps, TerminalSteps):
             if steps.interrupted.shape != (count,) or steps.interrupted.dtype != BOOL:
                 return False
@@ -83,14 +85,17 @@ class RecordCheck:
             masks = [(mask.shape, mask.dtype) for mask in steps.action_mask]
             if masks != [((count, size), BOOL) for size in self._branches]:
                 return False
+
         sensors = [(obs.shape, obs.dtype) for obs in steps.obs]
         return sensors == [((count, *shape), FLOAT32) for shape in self._shapes]
 
     def _check_ids(self, steps: Steps) -> None:
         """Refuse ids that stand twice in a result, and negative ones (which stand for free places here)."""
+        # Mostly the same agents ask again: equal ids were looked at already.
         seen = steps.agent_id.tobytes()
         if seen == self._unique.get(type(steps)):
             return
+
         ids = steps.agent_id.tolist()
         if len(set(ids)) < len(ids):
             twice = next(agent for row, agent in enumerate(ids) if agent in ids[:row])
@@ -102,6 +107,7 @@ class RecordCheck:
             raise EnvironmentDataError(
                 f"behavior {self.name!r}, agent {min(ids)}: ids of agents must be >= 0"
             )
+
         self._unique[type(steps)] = seen
 
     def _check_numbers(self, steps: Any) -> None:
@@ -109,6 +115,7 @@ class RecordCheck:
         for index, obs in enumerate(steps.obs):
             if np.count_nonzero(np.isfinite(obs)) < obs.size:
                 self._refuse(steps, obs, f"sensor {sensor_name(self.spec, index)}")
+
         for what, values in (("reward", steps.reward), ("group reward", steps.group_reward)):
             if np.count_nonzero(np.isfinite(values)) < values.size:
                 self._refuse(steps, values, what)
@@ -127,6 +134,7 @@ class RecordCheck:
         row = int(np.argwhere(~np.isfinite(values))[0][0])
         value = values[row][~np.isfinite(values[row])].flat[0] if values.ndim > 1 else values[row]
         kind = "decision" if isinstance(steps, DecisionSteps) else "terminal"
+
         raise EnvironmentDataError(
             f"behavior {self.name!r}, agent {int(steps.agent_id[row])}: its {what} holds {value} in a {kind} "
             "step; every number that an environment sends must be finite"
@@ -155,11 +163,13 @@ class Repair:
         group_reward = self._array(
             "group_reward", steps.group_reward, count, "fiub", FLOAT32, f"{each}, zeros without groups"
         )
+
         obs = self._observations(len(ids))
         if isinstance(steps, TerminalSteps):
             flags = f"{each}, True = time limit"
             interrupted = self._array("interrupted", steps.interrupted, count, "b", BOOL, flags)
             return TerminalSteps(obs, reward, interrupted, ids, groups, group_reward)
+
         return DecisionSteps(obs, reward, ids, self._masks(len(ids)), groups, group_reward)
 
     def _observations(self, count: int) -> list[np.ndarray]:
@@ -167,6 +177,7 @@ class Repair:
         if not isinstance(given, LISTS) or len(given) != len(sensors):
             got = f"{len(given)} arrays" if isinstance(given, LISTS) else show_kind(given)
             self._fail("obs", got, f"a list of {len(sensors)}, an array for each sensor of behavior_specs")
+
         return [
             self._array(
                 f"sensor {sensor_name(self.spec, index)}",
@@ -183,10 +194,12 @@ class Repair:
         branches, given = self.spec.action_spec.discrete_branches, self.steps.action_mask
         if given is None:
             return None
+
         if not isinstance(given, LISTS) or len(given) != len(branches):
             got = f"{len(given)} arrays" if isinstance(given, LISTS) else show_kind(given)
             wanted = f"None, or a list of {len(branches)}, an array for each discrete branch"
             self._fail("action_mask", got, wanted)
+
         each = f"a flag for each of {count} agents (agent_id) and each action, True = forbidden"
         return [
             self._array(f"action_mask of branch {branch}", values, (count, size), "biu", BOOL, each)
@@ -207,6 +220,7 @@ class Repair:
             raise EnvironmentDataError(
                 f"{self._head(what)} dtype {values.dtype}, not {np.dtype(dtype).name}: {why}"
             )
+
         with np.errstate(over="ignore"):  # what becomes infinite is refused as that
             return np.asarray(values, dtype)
 

@@ -45,21 +45,25 @@ def check_specs(specs: Any) -> None:
         raise EnvironmentDataError(
             f"behavior_specs is {show_kind(specs)}; it must be a mapping (a dict) of names to BehaviorSpec"
         )
+
     for name, spec in specs.items():
         if not isinstance(name, str) or not name:
             raise EnvironmentDataError(
                 f"behavior_specs has a name {name!r}; names must be texts: Game?team=0"
             )
+
         _, query, team = name.partition("?team=")
         if query and not team.isdigit():
             raise EnvironmentDataError(
                 f"behavior {name!r}: what follows ?team= must be a whole number: 0, 1 ..."
             )
+
         if not isinstance(spec, BehaviorSpec):
             raise EnvironmentDataError(
                 f"behavior {name!r}: its spec is {show_kind(spec)}; it must be a BehaviorSpec"
             )
         _check_spec(name, spec)
+
     for name in specs:
         side = next((other for other in specs if other.startswith(f"{name}?")), None)
         if side is not None:
@@ -77,7 +81,10 @@ def check_same_specs(specs: Any, first: Mapping[str, BehaviorSpec]) -> None:
     """
     if _are_same(specs, first):
         return
+
+    # Not the same objects: they may still be equal.
     check_specs(specs)
+
     for name, spec in first.items():
         if name not in specs:
             raise EnvironmentDataError(
@@ -88,6 +95,7 @@ def check_same_specs(specs: Any, first: Mapping[str, BehaviorSpec]) -> None:
             raise EnvironmentDataError(
                 f"behavior {name!r} has changed its spec: {specs[name]} now, {spec} at the start"
             )
+
     for name in specs:
         if name not in first:
             raise EnvironmentDataError(
@@ -163,6 +171,7 @@ def _check_spec(name: str, spec: BehaviorSpec) -> None:
         )
     if not sensors:
         raise EnvironmentDataError(f"behavior {name!r} has no observation: observation_specs is empty")
+
     for index, sensor in enumerate(sensors):
         shape = sensor.shape
         if not isinstance(shape, LISTS) or not shape or not all(_is_size(size) for size in shape):
@@ -175,6 +184,7 @@ def _check_spec(name: str, spec: BehaviorSpec) -> None:
         raise EnvironmentDataError(
             f"behavior {name!r}: action_spec is {show_kind(actions)}; it must be an ActionSpec"
         )
+
     continuous, branches = actions
     if not _is_size(continuous, 0) or not isinstance(branches, LISTS) or not all(map(_is_size, branches)):
         raise EnvironmentDataError(

@@ -83,11 +83,14 @@ class Contacts:
         `shift` gains the way out of overlaps, m.
         """
         self._measure(position, yaw, thing, thing_yaw)
+
+        # Most agents are near nothing: a coarse look along the axes spares the exact gaps.
         offset = self._offset.reshape(-1, NUM_TOUCHES, 3)
         distance = np.abs(offset)
         near = distance[:, :, 0] < _REACH[:, 0]
         near &= distance[:, :, 2] < _REACH[:, 1]
         near &= self._touchable.reshape(near.shape)
+
         touching = np.zeros(near.shape, bool)
         slots, what = np.nonzero(near)
         if slots.size:
@@ -98,6 +101,7 @@ class Contacts:
             solid = np.flatnonzero(touches & SOLID[what])
             if solid.size:
                 _stop(velocity, shift, slots[solid], what[solid], gap[solid], normal[solid])
+
         return touching.reshape(self._touchable.shape)
 
     def _measure(
@@ -107,9 +111,13 @@ class Contacts:
         offset = self._offset
         place = position.reshape(-1, NUM_AGENTS, 3)
         np.subtract(place[:, :, None], thing[:, None], out=offset[:, :, :NUM_THINGS])
+
+        # A column's offset along y stays 0: it is met at any height.
         flat = place[:, :, ::2]
         offset[:, :, COLUMN_BASE, ::2] = flat - np.copysign(COLUMN, flat)  # the nearest of the four
+
         np.subtract(place, place[:, NEXT], out=offset[:, :, NEXT_AGENT])
+
         self._yaw[:, :, :NUM_THINGS] = thing_yaw[:, None]
         self._yaw[:, :, NEXT_AGENT] = yaw.reshape(-1, NUM_AGENTS)[:, NEXT]
 
@@ -124,14 +132,19 @@ def stop_at_walls(position: np.ndarray, velocity: np.ndarray, extent: np.ndarray
     near = gap < CONTACT_GAP
     if not near.any():
         return
+
     sign = np.sign(side)
     shift[:, ::2] -= sign * push_out(gap)
+
+    # An approach that closes the gap just within the tick may stay.
     lack = (sign * velocity[:, ::2] - np.maximum(gap, 0.0) / TICK_S) * near
     rows = np.flatnonzero((lack > 0.0).any(axis=1))
     if rows.size:
         lack, stopped = np.maximum(lack[rows], 0.0), velocity[rows]
         flat = stopped[:, ::2]  # a view
         flat -= sign[rows] * lack
+
+        # Each wall rubs across its own axis, falls too: the one across x takes from z and y.
         slip = np.hypot(flat[:, ::-1], stopped[:, 1:2])  # along the wall across x, along the one across z
         kept = np.maximum(1.0 - BOX_FRICTION * lack / np.maximum(slip, 1e-12), 0.0)
         flat *= kept[:, ::-1]
@@ -149,14 +162,18 @@ def _stop(
 ) -> None:
     """Apply contacts [n] of `slots`, in ascending order, with `what`; no slot meets one thing twice."""
     out = push_out(gap)[:, None] * normal
+
     paired = what == NEXT_AGENT
     if paired.any():
         _stop_pairs(velocity, shift, slots[paired], gap[paired], normal[paired], out[paired])
         rows = np.flatnonzero(~paired)
         slots, what, gap, normal, out = slots[rows], what[rows], gap[rows], normal[rows], out[rows]
+
+    # What is written back keeps one row a slot, so a turn must hold no slot twice.
     turns = [np.arange(len(slots))]
     if (slots[1:] == slots[:-1]).any():  # between two things: in turns
         turns = [np.flatnonzero(what == one) for one in np.unique(what)]
+
     for rows in turns:
         chosen = slots[rows]
         stopped = velocity[chosen]
@@ -176,6 +193,7 @@ def _stop_pairs(
     """Stop agents `slots` [n] and their partners from approaching; an agent may be in two pairs: in turns."""
     mobility = np.full(3, 1.0 / MASS)
     number = slots % NUM_AGENTS
+
     for one in np.unique(number):
         rows = np.flatnonzero(number == one)
         first = slots[rows]
@@ -183,5 +201,6 @@ def _stop_pairs(
         stopped, other = velocity[first], velocity[second]
         stop_pair(stopped, other, normal[rows], gap[rows], mobility, mobility)
         velocity[first], velocity[second] = stopped, other
+        # Both weigh the same: each gives way by half.
         shift[first] += 0.5 * out[rows]
         shift[second] -= 0.5 * out[rows]

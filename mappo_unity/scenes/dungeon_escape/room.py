@@ -69,9 +69,11 @@ class DungeonRoom:
     def __init__(self, num_areas: int, gravity: float) -> None:
         num_slots = num_areas * NUM_AGENTS
         self.gravity = gravity
+
         self.position = np.full((num_slots, 3), 1e3)  # nowhere before the first reset
         self.velocity = np.zeros((num_slots, 3))
         self.yaw = np.zeros(num_slots)
+
         self.thing = np.full((num_areas, NUM_THINGS, 3), 1e3)
         self.thing[:, LOCK] = LOCK_CENTRE
         self.thing[:, PORTAL] = PORTAL_CENTRE
@@ -79,9 +81,11 @@ class DungeonRoom:
         self.thing_yaw[:, PORTAL] = PORTAL_YAW
         self.present = np.zeros((num_areas, NUM_THINGS), bool)
         self.present[:, [LOCK, PORTAL]] = True
+
         self.dragon_fall = np.zeros(num_areas)
         self.dragon_speed = np.zeros(num_areas)
         self._dragon_way = np.zeros((num_areas, 2))  # unit vector along x and z
+
         self._drive = np.zeros((num_slots, 3))  # m/s, asked for in this tick
         self._extent = np.zeros(num_slots)  # m: half the agents' width along the room's axes, in this tick
         self._contacts = Contacts(num_areas)
@@ -110,12 +114,17 @@ class DungeonRoom:
         """
         turn = rng.integers(0, 4, len(areas))
         self._place_agents(areas, rng, enabled)
+
+        # Only now: the bodies of the ended episode were in the way of the agents.
         self.present[areas, KEY] = False
         self.present[areas, TOMB] = False
         self.present[areas, DRAGON] = True
+
+        # Its start is fixed in the world; here it depends on the platform's quarter turn.
         self.thing[areas, DRAGON, 1] = DRAGON_START_Y
         self.thing[areas, DRAGON, ::2] = DRAGON_START[turn]
         self.thing_yaw[areas, DRAGON] = DRAGON_START_YAW[turn]  # until its first move
+
         self.dragon_fall[areas] = 0.0
         self.dragon_speed[areas] = rng.uniform(*speed, len(areas))
         self.aim_at_portal(areas)
@@ -140,15 +149,19 @@ class DungeonRoom:
     def step(self) -> np.ndarray:
         """Advance by one tick after `push`; return bool [N, A, K], what each agent touches at its start."""
         self._move_dragons()
+
         position, velocity = self.position, self.velocity
         falling = self._fall()
         shift = np.zeros_like(position)
         touching = self._contacts.stop(position, velocity, self.yaw, self.thing, self.thing_yaw, shift)
         stop_at_walls(position, velocity, self._extent, shift)
+
+        # Shifts out of overlaps leave no velocity behind.
         position += velocity * TICK_S
         position += shift
         if falling:
             position[position[:, 1] < STANDING + 1e-9, 1] = STANDING  # no trace of rounding
+
         return touching
 
     def dragon_escapes(self) -> np.ndarray:
@@ -162,6 +175,7 @@ class DungeonRoom:
             yaw, turn = self.thing_yaw[areas, DRAGON], self.thing_yaw[areas, PORTAL]
             gap, _ = box_gap(offset, yaw, HALVES[DRAGON], HALVES[PORTAL], turn)
             near[areas] = gap < CONTACT_GAP
+
         return near
 
     def local_velocity(self, slots: np.ndarray) -> np.ndarray:
@@ -181,12 +195,15 @@ class DungeonRoom:
 
     def _place_agents(self, areas: np.ndarray, rng: np.random.Generator, enabled: np.ndarray) -> None:
         shape = (-1, NUM_AGENTS)
+        # The tombstone is there twice: its upper and its lower box, as in `spawn.BODY_HALVES`.
         bodies, things = [DRAGON, KEY, TOMB, TOMB], self.thing[areas]
         centre = np.concatenate([self.position.reshape(*shape, 3)[areas], things[:, bodies]], axis=1)
         centre[:, -1, 1] -= TOMB_DROP  # its lower box
         yaw = np.concatenate([self.yaw.reshape(shape)[areas], self.thing_yaw[areas][:, bodies]], axis=1)
         present = np.concatenate([enabled[areas], self.present[areas][:, bodies]], axis=1)
+
         position, turn = draw_poses(rng, centre, yaw, present)
+
         self.position.reshape(*shape, 3)[areas] = position
         self.yaw.reshape(shape)[areas] = turn
         self.velocity.reshape(*shape, 3)[areas] = 0.0
@@ -198,11 +215,14 @@ class DungeonRoom:
         pull = self.gravity * TICK_S
         gap = self.position[:, 1] - STANDING
         falling = bool(gap.any())
+
+        # While all stand on the floor, gravity is only what presses them on it.
         if not falling:
             velocity[:, 1] = 0.0
             velocity *= DRAG_KEPT
             slide(velocity, pull * DRAG_KEPT)
             return False
+
         velocity[:, 1] -= pull
         velocity *= DRAG_KEPT
         taken = np.maximum(-velocity[:, 1] - gap / TICK_S, 0.0)  # lands exactly
@@ -215,6 +235,8 @@ class DungeonRoom:
         position = self.thing[:, DRAGON]
         self.thing_yaw[:, DRAGON] = np.arctan2(self._dragon_way[:, 0], self._dragon_way[:, 1])
         position[:, ::2] += self._dragon_way * (self.dragon_speed * TICK_S)[:, None]
+
+        # A dragon starts 0.04 m above the floor.
         height = position[:, 1] - DRAGON_STANDING
         if height.any():
             self.dragon_fall -= self.gravity * TICK_S
@@ -222,6 +244,7 @@ class DungeonRoom:
             self.dragon_fall[:] = np.maximum(self.dragon_fall, -height / TICK_S)
             position[:, 1] += self.dragon_fall * TICK_S
             position[position[:, 1] < DRAGON_STANDING + 1e-9, 1] = DRAGON_STANDING
+
         beside = np.abs(np.abs(position[:, ::2]) - COLUMN) < DRAGON_REACH
         near = np.flatnonzero(beside[:, 0] & beside[:, 1])
         if near.size:
@@ -229,4 +252,5 @@ class DungeonRoom:
             offset[:, ::2] -= np.copysign(COLUMN, offset[:, ::2])
             gap, normal = box_gap(offset, self.thing_yaw[near, DRAGON], HALVES[DRAGON], HALVES[COLUMN_BASE])
             position[near] += push_out(gap)[:, None] * normal
+            # From where it was pushed to, the way to the portal is another one.
             self.aim_at_portal(near[gap < 0])

@@ -63,10 +63,12 @@ class DungeonEscape(Scene):
         self.room = DungeonRoom(self.num_areas, self.parameters["gravity"])
         self.enabled = self.agents.enabled.reshape(self.num_areas, NUM_AGENTS)  # a view
         self.slots = np.arange(self.num_slots).reshape(self.num_areas, NUM_AGENTS)
+
         self.has_key = np.zeros((self.num_areas, NUM_AGENTS), bool)
         self.at_lock = np.zeros((self.num_areas, NUM_AGENTS), bool)  # touched the lock in the last tick
         self.remaining = np.full(self.num_areas, NUM_AGENTS)  # neither killed nor gone through the portal
         self.timer = np.zeros(self.num_areas, np.int64)  # ticks since the area's reset
+
         self._groups = self.home_groups()
 
     def reset(self) -> None:
@@ -84,6 +86,7 @@ class DungeonEscape(Scene):
         body = np.zeros((len(slots), 10), np.float32)
         body[:, :3] = self.room.local_velocity(slots)
         body[:, 9] = 1.0  # the pose relative to the agent itself: no offset, no rotation
+
         return [
             body,
             see(self.room, slots, self.enabled),
@@ -111,16 +114,22 @@ class DungeonEscape(Scene):
         self.at_lock = at_lock
         if not (touching[:, :, PORTAL : KEY + 1].any() or entered.any() or escaped.any()):
             return
+
         taken = _first(touching[:, :, KEY])
         self.has_key |= taken
         self.room.present[:, KEY] &= ~taken.any(axis=1)
+
         self._kill(_first(touching[:, :, DRAGON]))
+
         unlocked = entered & self.has_key
         self.has_key &= ~unlocked  # the key is used up before the episode's last record
         self._unlock(np.any(unlocked, axis=1))
+
         self._enter_portal(touching[:, :, PORTAL])
+        # Where the area was reset in this tick (timer 0), the dragon that escaped is gone.
         escaped &= self.room.present[:, DRAGON] & (self.timer > 0)
         self._end_groups(np.flatnonzero(escaped))
+
         self.room.refresh(self.enabled)
 
     def parameter_changed(self, name: str) -> None:
@@ -180,7 +189,10 @@ class DungeonEscape(Scene):
         self.remaining[areas] = NUM_AGENTS
         self.at_lock[areas] = False
         self.has_key[areas] = False
+
+        # Before they are enabled again: those still enabled are in the way of new spots.
         self.room.reset(areas, self.rng, self.enabled, DRAGON_SPEED)
+
         slots = self.slots[areas].ravel()
         self.enable(slots, self._groups[slots])
         self.room.refresh(self.enabled)

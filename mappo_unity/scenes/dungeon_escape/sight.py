@@ -67,21 +67,27 @@ def see(room: DungeonRoom, slots: np.ndarray, enabled: np.ndarray) -> np.ndarray
     height = origin[:, 0, :, 1]  # [n, 1]
     origin, direction = origin[..., ::2], direction[..., ::2]  # [n, 1, 1, 2], [n, R, 1, 2]
     distance = np.full((*direction.shape[:2], len(_TAGS)), np.inf)
+
     centre, yaw, present = _boxes(room, slots, enabled)
     low, high = centre[..., 1] - _HALVES[:, 1], centre[..., 1] + _HALVES[:, 1]
     radius = np.where(present, flat_radius(EYES.radius, height, low, high), 0.0)  # [n, M]
     reach = np.where(radius > 0, radius + np.hypot(_HALVES[:, 0], _HALVES[:, 2]), -1.0)
+    # A column's shaft is met at every height, its base only low down.
     reach[:, :_NUM_BASES] = np.maximum(reach[:, :_NUM_BASES], _COLUMN_REACH)
+
     centre = centre[..., ::2]
+    # Only pairs of a ray and a box that it can meet are looked at closely.
     agent, ray, box = np.nonzero(passes(origin, direction, centre[:, None], reach[:, None]))
     start, ahead, middle = origin[agent, 0, 0], direction[agent, ray, 0], centre[agent, box]
     travel = cast_rectangles(
         start, ahead, radius[agent, box], middle, _HALVES[box, ::2], yaw[agent, box], CONTACT_GAP
     )
+
     column = np.flatnonzero(box < _NUM_BASES)  # round above its square base
     shaft = cast_spheres(start[column], ahead[column], middle[column], _COLUMN_REACH, CONTACT_GAP)
     travel[column] = np.minimum(travel[column], shaft)
     distance[agent, ray, box] = travel
+
     distance[:, :, -2:] = _cast_walls(origin[:, :, 0], direction[:, :, 0])
     return EYES.encode(distance, _TAGS)
 
@@ -102,17 +108,22 @@ def _boxes(
     shape = (len(enabled), _NUM_BOXES - NUM_AGENTS)  # first what all agents of an area see, [N, M - A]
     things = slice(_NUM_BASES, _NUM_BASES + len(_THINGS))
     centre, yaw, present = np.empty((*shape, 3)), np.zeros(shape), np.ones(shape, bool)
+
     centre[:, :_NUM_BASES] = _BASES
     centre[:, things], yaw[:, things] = room.thing[:, _THINGS], room.thing_yaw[:, _THINGS]
     present[:, things] = room.present[:, _THINGS]
+
     dragon_yaw = room.thing_yaw[:, DRAGON]
+    # The dragon carries its key before it: from the front rays meet the key first.
     centre[:, -2:] = room.thing[:, [TOMB, DRAGON]]  # the tombstone's lower box, the dragon's key
     centre[:, -2:, 1] += (-TOMB_DROP, CARRIED_KEY[1])
     centre[:, -1, 0] += CARRIED_KEY[0] * np.sin(dragon_yaw)
     centre[:, -1, 2] += CARRIED_KEY[0] * np.cos(dragon_yaw)
     yaw[:, -2:], present[:, -2:] = room.thing_yaw[:, [TOMB, DRAGON]], room.present[:, [TOMB, DRAGON]]
+
     areas = slots // NUM_AGENTS
     others = np.arange(NUM_AGENTS) != (slots % NUM_AGENTS)[:, None]  # one's own eyes are inside one's body
+
     return (
         np.concatenate([centre, room.position.reshape(-1, NUM_AGENTS, 3)], axis=1)[areas],
         np.concatenate([yaw, room.yaw.reshape(-1, NUM_AGENTS)], axis=1)[areas],

@@ -39,10 +39,13 @@ def draw_poses(
     dragon, key and tombstone of the ended episode.
     """
     centre, yaw, present = centre.copy(), yaw.copy(), present.copy()
+
     for number in range(NUM_AGENTS):
         centre[:, number] = _free_spots(rng, centre, yaw, present)
         yaw[:, number] = rng.uniform(0.0, 2 * np.pi, len(yaw))
+        # Also one that was gone is in the way of the next, once it has a place.
         present[:, number] = True
+
     return centre[:, :NUM_AGENTS], yaw[:, :NUM_AGENTS]
 
 
@@ -52,6 +55,7 @@ def _free_spots(
     """Return a free spot [n, 3] for each of n areas: the first of uniform draws that overlaps nothing."""
     spot = np.full((len(centre), 3), SPAWN_Y)
     todo = np.arange(len(centre))
+
     while todo.size:
         drawn = np.full((len(todo), TRIES, 3), SPAWN_Y)
         drawn[:, :, ::2] = rng.uniform(-RANGE, RANGE, (len(todo), TRIES, 2))
@@ -59,13 +63,16 @@ def _free_spots(
         found = free.any(axis=1)
         spot[todo[found]] = drawn[found, free[found].argmax(axis=1)]
         todo = todo[~found]
+
     return spot
 
 
 def _is_free(spot: np.ndarray, centre: np.ndarray, yaw: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Return bool [n, T]: at which spots [n, T, 3] the query box overlaps no column and no body [n, 7]."""
+    # A column is round: it is clear of the box if the box's nearest point is.
     beside = np.maximum(np.abs(np.abs(spot[:, :, ::2]) - COLUMN) - QUERY_HALF[0], 0.0)
     free = (beside**2).sum(axis=-1) > COLUMN_RADIUS**2
+
     shape = (*free.shape, len(BODY_HALVES))
     offset = (centre[:, None] - spot[:, :, None]).reshape(-1, 3)
     turned = np.broadcast_to(yaw[:, None], shape).ravel()

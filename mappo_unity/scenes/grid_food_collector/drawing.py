@@ -39,8 +39,10 @@ def shapes(scene: GridFoodCollector, area: int) -> list[Shape]:
     drawn = [box((0, -0.1, 0), (WALL_FACE, 0.1, WALL_FACE), FLOOR, shadow=False)]
     drawn += floor_lines(WALL_FACE, 10.0, 0.12, LINE)
     drawn += square_walls(WALL_FACE, WALL_FACE, WALL_HEIGHT, 1.0, WALL)
+
     for number, place in enumerate(physics.ball_position[:, area].T):
         drawn.append(ball(place, BALL_RADIUS, GREEN if number < GOOD else RED))
+
     for agent in range(AGENTS):
         yaw = float(physics.agent_yaw[area, agent])
         color = FROZEN_COLOR if scene.frozen[area, agent] else BLUE
@@ -48,6 +50,7 @@ def shapes(scene: GridFoodCollector, area: int) -> list[Shape]:
         drawn += agent_cube(place, half, yaw, color, headband=agent == 0)
         if scene.laser_on[area, agent]:
             drawn.append(_laser(place, yaw))
+
     return drawn
 
 

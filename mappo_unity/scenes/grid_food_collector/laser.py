@@ -28,18 +28,24 @@ def targets(physics: FoodPhysics, yaw: np.ndarray, shooting: np.ndarray) -> np.n
     area, shooter = np.nonzero(shooting)
     start = physics.agent_position[:, area, shooter]
     ahead = np.stack([np.sin(yaw[area, shooter]), np.cos(yaw[area, shooter])])
+
     offset = physics.agent_position[:, area] - start[:, :, None]
     travel = _to_boxes(offset, physics.agent_half[area], yaw[area], ahead)
+    # No shot meets its shooter.
     travel[np.arange(area.size), shooter] = np.inf
+
     nearest = travel.argmin(axis=1)
     travel = travel[np.arange(area.size), nearest]
     meets = np.flatnonzero(travel <= LENGTH)
     if not meets.size:
         return hit
+
+    # Balls and walls matter only to shots that reach an agent.
     start, ahead, balls = start[:, meets], ahead[:, meets], physics.ball_position[:, area[meets]]
     blocked = np.minimum(_to_balls(balls - start[:, :, None], ahead), _to_walls(start, ahead))
     meets = meets[travel[meets] <= blocked]
     hit[area[meets], shooter[meets]] = nearest[meets]
+
     return hit
 
 
@@ -51,23 +57,31 @@ def _to_boxes(offset: np.ndarray, half: np.ndarray, yaw: np.ndarray, ahead: np.n
     ways = np.full(yaw.shape, np.inf)
     dx, dz = ahead[:, :, None]
     along, aside = offset[0] * dx + offset[2] * dz, np.abs(offset[0] * dz - offset[2] * dx)
+
+    # At any yaw a cube lies within the circle through its corners.
     reach = RADIUS + np.sqrt(2) * half
     near = (along > 0) & (along < LENGTH + reach) & (aside < reach)
     if not near.any():
         return ways
+
     shot = np.nonzero(near)[0]
     half, sin, cos = half[near], np.sin(yaw[near]), np.cos(yaw[near])
     x, height, z = offset[:, near]  # from here on in the cube's frame
+    # The sphere counts with the disc that is left of it at the gap in height.
     height = np.maximum(np.abs(height) - half, 0.0)
     radius = np.sqrt(np.maximum(RADIUS**2 - height * height, 0.0))
     x, z = z * sin - x * cos, -x * sin - z * cos  # from the cube to the shooter
     dx, dz = ahead[0, shot] * cos - ahead[1, shot] * sin, ahead[0, shot] * sin + ahead[1, shot] * cos
+
     wide = half + radius
     rectangles = _to_rectangles(x, z, dx, dz, np.array([wide, half]), np.array([half, wide]))
     discs = _to_discs(_CORNERS[0] * half - x, _CORNERS[1] * half - z, dx, dz, radius)
     way = np.minimum(rectangles.min(axis=0), discs.min(axis=0))
+
+    # What the sphere overlaps at its start is not seen.
     outside = np.maximum(np.abs(x) - half, 0.0) ** 2 + np.maximum(np.abs(z) - half, 0.0) ** 2
     ways[near] = np.where((outside > radius * radius) & (radius > 0), way, np.inf)
+
     return ways
 
 

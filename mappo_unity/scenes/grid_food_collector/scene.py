@@ -49,11 +49,13 @@ class GridFoodCollector(Scene):
         super().__init__(**options)
         self.physics = FoodPhysics(self.num_areas, AGENTS, GOOD + BAD)
         shape = (self.num_areas, AGENTS)
+
         self.yaw_degrees = np.zeros(shape, np.int64)  # whole degrees: only these ever occur
         self.frozen = np.zeros(shape, bool)
         self.frozen_tick = np.zeros(shape, np.int64)
         self.laser_on = np.zeros(shape, bool)
         self.tick = 0  # of the scene, never reset
+
         self._drive = np.zeros((3, *shape))
         self._new_food = False
         self._food_tags = np.repeat([FOOD, BAD_FOOD], [GOOD, BAD])
@@ -69,12 +71,14 @@ class GridFoodCollector(Scene):
         if self._new_food:
             self._new_food = False
             self._create_food()
+
         area, agent = np.divmod(slots, AGENTS)
         physics, num = self.physics, len(slots)
         physics.agent_velocity[:, area, agent] = 0
         physics.agent_position[1, area, agent] = AGENT_HEIGHT
         physics.agent_position[::2, area, agent] = self.rng.uniform(-RANGE, RANGE, (2, num))
         physics.agent_half[area, agent] = 0.5 * self.parameters["agent_scale"]
+
         self.yaw_degrees[area, agent] = self.rng.integers(0, 360, num)
         self.frozen[area, agent] = False
         self.laser_on[area, agent] = False
@@ -88,6 +92,7 @@ class GridFoodCollector(Scene):
         place, yaw = physics.agent_position[:, area, agent], physics.agent_yaw[area, agent]
         scale = 2 * physics.agent_half[area, agent]
         view = grid_sensor.View(place[0], place[2], np.sin(yaw), np.cos(yaw), scale)
+
         food = physics.ball_position[:, area] - place[:, :, None]
         others = physics.agent_position[:, area] - place[:, :, None]
         parts = [
@@ -102,6 +107,7 @@ class GridFoodCollector(Scene):
             ),
             grid_sensor.square_lines(view, WALL_LINES, WALLS, place[1] <= WALL_HEIGHT),
         ]
+
         return [grid_sensor.one_hot(view, GRID.shape[0], parts)]
 
     def act(self, slots: np.ndarray) -> None:
@@ -111,17 +117,23 @@ class GridFoodCollector(Scene):
         command = self.agents.discrete[:, 0].reshape(shape) > 0
         turn = np.where(np.abs(throttle[:, :, 2]) > TURN_THRESHOLD, np.sign(throttle[:, :, 2]), 0)
         turned = (self.yaw_degrees - TURN_DEGREES * turn.astype(np.int64)) % 360  # positive: to the left
+
+        # Shots first: whom an earlier agent freezes is not active in this tick.
         active = self._shoot(command, turned)
         self.laser_on = active & command
+
+        # The push goes along the heading before the turn.
         self._push(throttle, active)
         self.yaw_degrees = np.where(active, turned, self.yaw_degrees)
         self._turn_bodies()
+
         self.tick += 1
 
     def simulate(self) -> None:
         """Advance physics; food that agents touch is eaten and falls in anywhere with its speed kept."""
         area, agent, food = self.physics.step(self._drive)
         self._drive[:] = 0
+
         if area.size:
             reward = self._food_rewards[food]
             self.agents.reward += np.bincount(area * AGENTS + agent, reward, self.num_slots).astype(
@@ -156,19 +168,24 @@ class GridFoodCollector(Scene):
         """
         thawing = self.frozen & (self.tick - self.frozen_tick >= FROZEN_TICKS)
         free = ~self.frozen | thawing
+
         hits = np.full(command.shape, food_laser.NOBODY)
         if (command & free).any():
             yaw = np.radians(np.where(free, turned, self.yaw_degrees))
             hits = food_laser.targets(self.physics, yaw, command & free)
+
         areas = np.flatnonzero((hits >= 0).any(axis=1))
         frozen, hits = self.frozen[areas], hits[areas]
+
         for agent in range(AGENTS if areas.size else 0):  # in turn: whom an earlier one stops does not act
             frozen[:, agent] &= ~thawing[areas, agent]
             free[areas, agent] = ~frozen[:, agent]
             shot = np.flatnonzero(~frozen[:, agent] & (hits[:, agent] >= 0))
+            # Who is frozen already does not wait any longer for a second shot.
             shot = shot[~frozen[shot, hits[shot, agent]]]
             frozen[shot, hits[shot, agent]] = True
             self.frozen_tick[areas[shot], hits[shot, agent]] = self.tick
+
         self.frozen &= ~thawing
         self.frozen[areas] = frozen
         return free
@@ -179,6 +196,7 @@ class GridFoodCollector(Scene):
         velocity *= np.where(self.laser_on, SHOT_KEPT, 1.0)
         squared = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
         velocity *= np.where(squared > BRAKE_ABOVE**2, BRAKE_KEPT, 1.0)
+
         speed = np.where(self.laser_on, MOVE_SPEED * SHOT_DRIVE, MOVE_SPEED) * active
         ahead, right = throttle[:, :, 0] * speed, throttle[:, :, 1] * speed
         sin, cos = np.sin(self.physics.agent_yaw), np.cos(self.physics.agent_yaw)

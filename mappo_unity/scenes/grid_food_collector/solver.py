@@ -57,28 +57,37 @@ class Solver:
         vertical = velocity[1, :-1]
         lift = np.maximum(slowest - vertical, 0.0)
         vertical += lift
+
         one, other, normal, gap, friction = contacts
         if not one.size:
             return lift
+
+        # In k contacts a body counts as k times as light, so that their impulses cannot add up to too much.
         share = np.bincount(one, minlength=velocity.shape[1])
         share += np.bincount(other, minlength=velocity.shape[1])
         mobility = self.inverse_mass * share
         mass = 1.0 / (mobility[one] + mobility[other])
+
         closing = np.maximum(gap, 0.0) / TICK_S  # the gap may be closed within the tick
         cells = _cells(one, other, velocity.shape[1])
         push = np.concatenate([normal * self.inverse_mass[one], normal * -self.inverse_mass[other]], axis=1)
         impulse = np.zeros(one.size)
+
         for _ in range(ROUNDS):
             speed = ((velocity[:, one] - velocity[:, other]) * normal).sum(axis=0)
+            # An impulse may shrink again in a later round, but it never pulls.
             grown = np.maximum(impulse - (speed + closing) * mass, 0.0)
             change = grown - impulse
             if np.abs(change).max() < NEGLIGIBLE:
                 break
             impulse = grown
             _add(velocity, cells, push * np.concatenate([change, change]))
+
+            # What contacts push into the floor, the floor lifts at once.
             more = np.maximum(slowest - vertical, 0.0)
             vertical += more
             lift += more
+
         self._rub(contacts, cells, velocity, spin, friction * impulse, share)
         return lift
 
@@ -107,13 +116,17 @@ class Solver:
         """
         one, other, normal, _, _ = contacts
         mass, inertia = self.inverse_mass, self.inverse_inertia
+
         slip = velocity[:, one] - velocity[:, other]
         slip -= self.radius * _cross(spin[:, one] + spin[:, other], normal)
         slip -= normal * (slip * normal).sum(axis=0)
+
         speed = np.sqrt((slip * slip).sum(axis=0))
         slip /= np.maximum(speed, 1e-9)
+
         mobility = share * (mass + self.radius**2 * inertia)
         impulse = np.minimum(speed / (mobility[one] + mobility[other]), limit)
+
         torque = _cross(normal, slip) * (self.radius * impulse)
         slip *= impulse
         _add(velocity, cells, np.concatenate([slip * -mass[one], slip * mass[other]], axis=1))

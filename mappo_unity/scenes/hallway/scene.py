@@ -68,6 +68,7 @@ class Hallway(Scene):
         self.position = np.tile([0.0, REST_Y, -15.0], (self.num_areas, 1))
         self.velocity = np.zeros((self.num_areas, 3))
         self.yaw = np.zeros(self.num_areas)
+
         self.symbol = np.tile([0.0, 2.5, 0.0], (self.num_areas, 1))
         self.shows_x = np.zeros(self.num_areas, bool)
         self.o_side = np.ones(self.num_areas)
@@ -76,13 +77,16 @@ class Hallway(Scene):
         """Show a symbol, put the agent far back with any heading, place the goals."""
         count = len(slots)
         self.shows_x[slots] = self.rng.random(count) < 0.5
+        # Only the O block is moved to a side; the X block stands at x = 0 in Unity, too.
         self.symbol[slots, 0] = np.where(self.shows_x[slots], 0.0, self.rng.uniform(-3, 3, count))
         self.symbol[slots, 2] = self.rng.uniform(-5, 5, count)
+
         self.position[slots, 0] = self.rng.uniform(-3, 3, count)
         self.position[slots, 1] = 1.5
         self.position[slots, 2] = self.rng.uniform(-20, -10, count)
         self.yaw[slots] = self.rng.uniform(0, 2 * np.pi, count)
         self.velocity[slots] = 0
+
         self.o_side[slots] = np.where(self.rng.random(count) < 0.5, 1.0, -1.0)
 
     def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
@@ -104,9 +108,12 @@ class Hallway(Scene):
         velocity, start = self.velocity, self.position.copy()
         velocity[:, 1] -= self.parameters["gravity"] * TICK_S
         velocity *= DRAG_KEPT
+
+        # Just as much as lands it on the floor; friction takes its share of the same impulse.
         landing = np.maximum((REST_Y - start[:, 1]) / TICK_S - velocity[:, 1], 0.0)
         velocity[:, 1] += landing
         slide(velocity, landing)
+
         self.position += velocity * TICK_S
         self._stop_at_walls()
         self._stop_at_symbols(start)
@@ -125,23 +132,32 @@ class Hallway(Scene):
         """Cast the level rays at goals, walls and the block; the floor is not seen by them."""
         count, position = len(slots), self.position[slots]
         origin, direction = EYES.casts(position, self.yaw[slots])
+
         centres = np.empty((count, 1, 9, 2))
         centres[:, 0, :8] = _CENTRES
         centres[:, 0, 8] = self.symbol[slots][:, ::2]
+
         radius = np.full((count, 1, 9), EYES.radius)
+        # The rays pass above the thin plates: only a part of the cast sphere meets them.
         plate = PLATE_CENTRE[0] + np.array([-PLATE_HALF[1], PLATE_HALF[1]])
         radius[:, 0, :2] = flat_radius(EYES.radius, position[:, 1:2], plate[:1], plate[1:])
+
         distance = cast_rectangles(
             origin[..., ::2], direction[..., ::2], radius, centres, _HALVES, skip_gap=TOUCH_GAP
         )
+
         tags = np.full((count, 9), WALL)
+        # Columns 0 and 2 are plate and panel on the right, 1 and 3 those on the left.
         tags[:, 0:4:2] = np.where(self.o_side[slots] > 0, O_GOAL, X_GOAL)[:, None]
         tags[:, 1:4:2] = np.where(self.o_side[slots] > 0, X_GOAL, O_GOAL)[:, None]
         tags[:, 8] = np.where(self.shows_x[slots], X_BLOCK, O_BLOCK)
+
         return EYES.encode(distance, tags)
 
     def _stop_at_walls(self) -> None:
+        # Along x and z a turned square reaches further.
         reach = AGENT_HALF[0] * (np.abs(np.sin(self.yaw)) + np.abs(np.cos(self.yaw)))
+
         for axis, inner in ((0, ROOM_HALF[0]), (2, ROOM_HALF[1])):
             place = self.position[:, axis]
             hit = np.flatnonzero(np.abs(place) + reach > inner)
@@ -157,10 +173,12 @@ class Hallway(Scene):
         That side's axis separated them at the `start` of the tick; the block is thinner than twice a
         tick's way, so the axis of least depth may be another one.
         """
+        # 2.8 and 1.3 m: the block's half sizes and half the agent's diagonal (0.71 m), rounded up.
         way = np.abs(self.position - self.symbol)
         near = np.flatnonzero((way[:, 0] < 2.8) & (way[:, 2] < 1.3))
         if not near.size:
             return
+
         symbol, yaw = self.symbol[near], self.yaw[near]
         gaps, normals = axis_gaps(self.position[near] - symbol, yaw, AGENT_HALF, SYMBOL_HALF)
         hit = np.flatnonzero((gaps < 0).all(axis=0))
@@ -177,17 +195,20 @@ class Hallway(Scene):
         self.velocity[slots] = velocity
 
     def _touch_goals(self) -> None:
+        # Plates begin at z 20.29; half the agent's diagonal is 0.71 m.
         near = np.flatnonzero(self.position[:, 2] > 19.5)
         if not near.size:
             return
-        side = np.where(
-            self.position[near, 0] < 0, -1.0, 1.0
-        )  # only the goal of the agent's side can be in reach
+
+        # Only the goal of the agent's side can be in reach.
+        side = np.where(self.position[near, 0] < 0, -1.0, 1.0)
+
         touched = np.zeros(near.size, bool)
         for (y, z), half in ((PLATE_CENTRE, PLATE_HALF), (PANEL_CENTRE, PANEL_HALF)):
             centre = np.stack([GOAL_X * side, np.full(near.size, y), np.full(near.size, z)], axis=1)
             gap, _ = box_gap(self.position[near] - centre, self.yaw[near], AGENT_HALF, half)
             touched |= gap < CONTACT_GAP
+
         if touched.any():
             slots = near[touched]
             touched_o = side[touched] == self.o_side[slots]
