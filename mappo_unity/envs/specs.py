@@ -58,7 +58,7 @@ def _action_spec(behavior: BehaviorState, shape: torch.Size, limit: float) -> An
     if not size:
         return MultiCategorical(branches, (*shape, len(branches)), dtype=torch.int64)
 
-    # both kinds in one tensor: branch indices are floats here; below n, a random one cut to a whole number is valid
+    # both kinds in one tensor: branch indices are floats, below n so that cutting a random one is valid
     low = torch.tensor([-limit] * size + [0.0] * len(branches)).expand(*shape, -1)
     high = torch.tensor([limit] * size + [n - 1e-3 for n in branches]).expand(*shape, -1)
 
