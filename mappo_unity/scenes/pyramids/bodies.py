@@ -123,7 +123,7 @@ class PyramidsBodies:
         velocity[:, 1] -= GRAVITY * TICK_S
         velocity *= DRAG_KEPT
 
-        # what is solved later has the last word: the outer walls, which nothing passes
+        # what is solved later has the last word, so the outer walls come last
         self._shift[:] = 0.0
         self._ground()
         touching = self._switch()
@@ -137,7 +137,6 @@ class PyramidsBodies:
         step[moved, ::2] = 0.0
         self.position += step
         self.position += self._shift
-
         self.switch_position[:, 1] += self.switch_fall * TICK_S
         self.switch_yaw += self.switch_spin * TICK_S
         self.age += 1
@@ -232,7 +231,6 @@ class PyramidsBodies:
         beside = self.position[:, None, ::2] - self._block
         reach = self._half + extent[:, None] + CONTACT_GAP
         areas, blocks = np.nonzero((np.abs(beside) < reach).all(axis=2))
-
         if not areas.size:
             return
 

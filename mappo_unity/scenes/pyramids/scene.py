@@ -84,7 +84,7 @@ class Pyramids(Scene):
         bodies, bricks = self.bodies, self.bricks
         pressed = bodies.solve() & ~self.switch_on
 
-        # agents near a pile move with it, in the bricks' engine; `move` leaves their x and z alone
+        # where a pile is awake the bricks' engine moves the agent, too; `move` leaves their x and z alone
         awake = bricks.wake(bodies.position, bodies.velocity, bodies.switch_position, bodies.switch_spin)
         switch = (bodies.switch_position, bodies.switch_yaw)
         goal = bricks.step(bodies.position, bodies.velocity, bodies.yaw, switch)
