@@ -42,6 +42,7 @@ def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv
         raise ConfigError(
             f"env.params.seed={cfg.params['seed']}: the environment's seed follows from the run's; use seed=N"
         )
+
     if cfg.backend is Backend.embedded:
         return _embedded(cfg)
     if cfg.backend is Backend.custom:
@@ -58,6 +59,7 @@ def _embedded(cfg: EnvConfig) -> MakeEnv:
 
     def make(seed: int) -> BaseEnv:
         scene = make_scene(cfg.name, seed=seed, **params)
+
         if cfg.name in BUILT_IN:
             return scene
         return GuardedEnv(scene, f"scene {cfg.name}", explain_error)  # what it raises is its author's to mend
@@ -94,6 +96,8 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
 
     def make(seed: int) -> BaseEnv:
         players: list[RestartingPlayer] = []
+
+        # all players start before the first is waited for; on an error none may be left running
         try:
             for number in range(cfg.num_players):
                 players.append(start(number, seed))
@@ -103,6 +107,7 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
             for player in players:
                 player.close()
             raise
+
         return players[0] if cfg.num_players == 1 else SeveralPlayers(players)
 
     return make
@@ -118,10 +123,12 @@ def find_player(cfg: EnvConfig) -> Path | None:
 
     if cfg.backend is Backend.editor:
         return None
+
     if cfg.backend is Backend.registry:
         from mappo_unity.protocol.registry import fetch_player
 
         return fetch_player(cfg.registry, cfg.registry_entry or cfg.name)
+
     return find_executable(str(cfg.file_name))
 
 
@@ -142,6 +149,7 @@ def _log_folder(cfg: EnvConfig, log_folder: Path | None) -> Path:
         folder = log_folder
     else:
         folder = Path(tempfile.mkdtemp(prefix="mappo-unity-players-"))
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -149,6 +157,7 @@ def _log_folder(cfg: EnvConfig, log_folder: Path | None) -> Path:
             f"the folder {folder} for players' logs cannot be made: {error.strerror}; choose another with "
             "env.player_logs"
         ) from error
+
     return folder.absolute()
 
 

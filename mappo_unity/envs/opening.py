@@ -42,10 +42,13 @@ def first_results(env: BaseEnv, max_steps: int) -> dict[str, First]:
         for name, spec in env.behavior_specs.items():
             check = RecordCheck(name, spec)
             behaviors[name] = First(check, *check(env.get_steps(name)))
+
         if any(len(first.decision) for first in behaviors.values()):
             return behaviors
+
         note_silence(attempt, max_steps)
         env.step()
+
     what = (
         f"get_steps gave no DecisionSteps of {list(behaviors)}"
         if behaviors
@@ -60,8 +63,10 @@ def first_results(env: BaseEnv, max_steps: int) -> dict[str, First]:
 def team_sizes(behaviors: Mapping[str, First]) -> dict[str, tuple[int, int]]:
     """Return of every behavior how many teams it has and the largest one's members: the most of any side."""
     sizes: dict[str, tuple[int, int]] = {}
+
     for name, first in behaviors.items():
         teams, members = count_teams(first.decision.agent_id, first.decision.group_id)
         seen = sizes.get(keys.policy_name(name), (1, 1))
         sizes[keys.policy_name(name)] = max(seen[0], teams), max(seen[1], members)
+
     return {name: sizes[keys.policy_name(name)] for name in behaviors}

@@ -51,14 +51,17 @@ class BehaviorState:
         count = self.slots.num_teams * self.slots.team_size
         self.obs = [np.zeros((count, *o.shape), np.float32) for o in self.spec.observation_specs]
         self.mask = np.ones((count, sum(self.spec.action_spec.discrete_branches)), bool)
+
         self.acting = np.zeros(count, bool)
         self.present = np.zeros(count, bool)
         self.departed = np.zeros(count, bool)
         self.order = np.zeros(0, np.int64)  # slots in the order of the last DecisionSteps
+
         self.individual_return = np.zeros(count)
         self.group_return = np.zeros(count)
         self.length = np.zeros(count, np.int64)
         self.finished: list[Episode] = []
+
         self.begin_round()
 
     def begin_round(self) -> None:
@@ -87,6 +90,7 @@ class BehaviorState:
         """
         slots = self.slots.lookup(agent_ids)
         self.crashed[slots[slots >= 0]] = True
+
         teams = self.crashed.reshape(-1, self.slots.team_size).any(1)
         self.crashed |= self.departed & np.repeat(teams, self.slots.team_size)
 
@@ -115,11 +119,14 @@ class BehaviorState:
         rows = action[self.order]
         size = self.spec.action_spec.continuous_size
         out = ActionTuple()
+
         if size:
             clipped = np.minimum(np.maximum(rows[:, :size], -limit), limit)
             out.add_continuous(clipped.astype(np.float32, copy=False) / np.float32(limit))
+
         if self.spec.action_spec.discrete_size:
             out.add_discrete(rows[:, size:].astype(np.int32))
+
         return out
 
     def _add_terminal(self, terminal: TerminalSteps) -> None:
@@ -127,6 +134,7 @@ class BehaviorState:
         own = slots >= 0
         if np.count_nonzero(own):
             own[own] = self.present[slots[own]] & ~self.departed[slots[own]]
+
         count = np.count_nonzero(own)
         if count < len(own):  # ends of agents that were never asked here: nobody's row
             if not count:
@@ -135,12 +143,15 @@ class BehaviorState:
             observations = [o[own] for o in terminal.obs]
         else:
             rows, observations = slots, terminal.obs
+
         interrupted = terminal.interrupted[own]
         self.reward[rows] += terminal.reward[own]
         self.group_reward[rows] += terminal.group_reward[own]
         self._finish_episodes(rows, terminal.reward[own], terminal.group_reward[own], interrupted)
         self.slots.ended[rows] = True
         self.present[rows] = False
+
+        # who ends while its team plays on departs: its slot stays, sees zeros and earns on
         leaves = np.zeros(len(rows), bool)
         if self.death_masking and self.slots.team_size > 1:
             leaves = self._team_plays_on(rows) & ~interrupted
@@ -149,18 +160,23 @@ class BehaviorState:
             self.present[rows[leaves]] = True
             for o in self.obs:
                 o[rows[leaves]] = 0
+
         over = ~leaves
         ends = rows[over]
         self.terminated[ends] = ~interrupted[over]
         self.truncated[ends] = interrupted[over]
+
         # copies: an environment may write its next observations into the same arrays
         self._terminal_obs.append((ends, [o[over] for o in observations]))
 
     def _add_decision(self, decision: DecisionSteps) -> None:
         slots = self.slots.assign(decision.agent_id, decision.group_id)
+
+        # an episode's return counts every reward, a row only what its action earned
         self.individual_return[slots] += decision.reward
         self.group_return[slots] += decision.group_reward
         self.length[slots] += 1
+
         goes_on = self.present[slots] & ~self.departed[slots]
         if np.count_nonzero(goes_on) == len(goes_on):
             earners, reward, group_reward = slots, decision.reward, decision.group_reward
@@ -172,15 +188,19 @@ class BehaviorState:
             self.slots.ended[slots] = False
             earners = slots[goes_on]
             reward, group_reward = decision.reward[goes_on], decision.group_reward[goes_on]
+
         self.reward[earners] += reward
         self.group_reward[earners] += group_reward
+
         if np.count_nonzero(self.departed):
             self._share_group_reward(slots, decision.group_reward)
+
         for own, new in zip(self.obs, decision.obs):
             own[slots] = new
         if self.mask.shape[1]:
             masks = decision.action_mask
             self.mask[slots] = True if masks is None else ~np.concatenate(masks, axis=1)
+
         self.acting[slots] = True
         self.order = slots
 
@@ -189,11 +209,13 @@ class BehaviorState:
     ) -> None:
         self.individual_return[rows] += reward
         self.group_return[rows] += group_reward
+
         for agent, slot, cut in zip(self.slots.agents_of(rows), rows.tolist(), interrupted.tolist()):
             if self.crashed[slot]:
                 continue
             returns = float(self.individual_return[slot]), float(self.group_return[slot])
             self.finished.append(Episode(agent, *returns, int(self.length[slot]), bool(cut)))
+
         self.individual_return[rows] = self.group_return[rows] = self.length[rows] = 0
 
     def _team_plays_on(self, rows: np.ndarray) -> np.ndarray:
@@ -206,9 +228,11 @@ class BehaviorState:
         if not np.count_nonzero(self.departed):
             return
         self._share_group_reward(rows, group_reward)
+
         team_ended = np.zeros(self.slots.num_teams, bool)
         team_ended[ends // self.slots.team_size] = True
         over = self.departed & np.repeat(team_ended, self.slots.team_size)
+
         self.terminated[over] = True
         self.departed[over] = False
         self.present[over] = False
@@ -216,8 +240,10 @@ class BehaviorState:
     def _share_group_reward(self, rows: np.ndarray, group_reward: np.ndarray) -> None:
         """Give the departed what a team mate of theirs received as group reward just now."""
         teams, first = np.unique(rows // self.slots.team_size, return_index=True)
+
         share = np.zeros(self.slots.num_teams, np.float32)
         share[teams] = group_reward[first]
+
         departed = np.flatnonzero(self.departed)
         self.group_reward[departed] += share[departed // self.slots.team_size]
 

@@ -25,6 +25,8 @@ class SlotTable:
         self.ended = np.ones(num_teams * team_size, bool)
         self.team_key = np.full(num_teams, FREE, np.int64)
         self._slot_of: dict[int, int] = {}
+
+        # mostly the same agents ask in the same order again: these skip the look-ups
         self._last_ids = np.zeros(0, np.int64)
         self._last_slots = np.zeros(0, np.int64)
 
@@ -42,10 +44,12 @@ class SlotTable:
         """
         if np.array_equal(agent_ids, self._last_ids):
             return self._last_slots
+
         slots = np.empty(len(agent_ids), np.int64)
         for row, (agent, group) in enumerate(zip(agent_ids.tolist(), group_ids.tolist())):
             slot = self._slot_of.get(agent)
             slots[row] = self._place(agent, group) if slot is None else slot
+
         self._last_ids, self._last_slots = agent_ids.astype(np.int64), slots
         return slots
 
@@ -58,22 +62,29 @@ class SlotTable:
         return self.agent_id[slots].tolist()
 
     def _place(self, agent: int, group: int) -> int:
+        # an agent without a group is a team by itself; its key is negative, as no group's is
         key = group if group > 0 else -1 - agent
         team = self._team(key, agent)
         members = slice(team * self.team_size, (team + 1) * self.team_size)
+
+        # slots never used come first, so that an ended agent keeps its own as long as there is room
         empty = np.flatnonzero(self.agent_id[members] == FREE)
         left = empty if len(empty) else np.flatnonzero(self.ended[members])
+
         if not len(left):
             raise ConfigError(
                 f"behavior {self.behavior!r}: agent {agent} is one more than the {self.team_size} slots of "
                 f"its team (group {group}); give room with env.max_team_size={self.team_size + 1} or more (a "
                 "member makes room with its terminal step)"
             )
+
         slot = team * self.team_size + int(left[0])
         self._slot_of.pop(int(self.agent_id[slot]), None)
         self._slot_of[agent] = slot
         self.agent_id[slot] = agent
         self.ended[slot] = False
+
+        # the slots of the last ids may have changed hands
         self._last_ids = np.zeros(0, np.int64)
         return slot
 
@@ -81,6 +92,7 @@ class SlotTable:
         known = np.flatnonzero(self.team_key == key)
         if len(known):
             return int(known[0])
+
         free = np.flatnonzero(self.team_key == FREE)
         if not len(free):
             ended = self.ended.reshape(self.num_teams, self.team_size).all(1)
@@ -91,12 +103,14 @@ class SlotTable:
                 f"team slots; give room with env.max_teams={self.num_teams + 1} or more (a team makes room "
                 "with the terminal steps of its members)"
             )
+
         team = int(free[0])
         members = slice(team * self.team_size, (team + 1) * self.team_size)
         for old in self.agent_id[members].tolist():
             self._slot_of.pop(old, None)
         self.agent_id[members] = FREE
         self.ended[members] = True
+
         self.team_key[team] = key
         return team
 
@@ -113,6 +127,8 @@ class SlotTable:
         self.agent_id = np.array(state["agent_id"], np.int64)
         self.ended = np.array(state["ended"], bool)
         self.team_key = np.array(state["team_key"], np.int64)
+
+        # what follows from the arrays is made anew
         self._slot_of = {int(a): s for s, a in enumerate(self.agent_id.tolist()) if a != FREE}
         self._last_ids = self._last_slots = np.zeros(0, np.int64)
 

@@ -20,20 +20,25 @@ def make_specs(
 ) -> tuple[Composite, Composite, Composite, Composite]:
     """Return the specs of observations, actions, rewards and ends, an entry ``[G, A, ...]`` a behavior."""
     observation, action, reward, done = {}, {}, {}, {}
+
     for behavior_name, behavior in behaviors.items():
         name = entry_of[behavior_name]
         shape = torch.Size((behavior.slots.num_teams, behavior.slots.team_size))
+
         entries: dict[str, Any] = {
             keys.SENSOR.format(i): Unbounded((*shape, *o.shape[1:])) for i, o in enumerate(behavior.obs)
         }
         for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED):
             entries[key] = Binary(1, (*shape, 1), dtype=torch.bool)
+
         if behavior.mask.shape[1]:
             entries[keys.MASK] = Binary(
                 behavior.mask.shape[1], (*shape, behavior.mask.shape[1]), dtype=torch.bool
             )
+
         observation[name] = Composite(entries, shape=shape)
         action[name] = Composite({keys.ACTION: _action_spec(behavior, shape, action_limit)}, shape=shape)
+
         rewards = {key: Unbounded((*shape, 1)) for key in (keys.REWARD, keys.GROUP_REWARD)}
         reward[name] = Composite(rewards, shape=shape)
         ends = {
@@ -41,6 +46,7 @@ def make_specs(
             for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
         }
         done[name] = Composite(ends, shape=shape)
+
     return Composite(observation), Composite(action), Composite(reward), Composite(done)
 
 
@@ -51,6 +57,9 @@ def _action_spec(behavior: BehaviorState, shape: torch.Size, limit: float) -> An
         return Bounded(-limit, limit, (*shape, size), dtype=torch.float32)
     if not size:
         return MultiCategorical(branches, (*shape, len(branches)), dtype=torch.int64)
+
+    # both kinds in one tensor: branch indices are floats, below n so that cutting a random one is valid
     low = torch.tensor([-limit] * size + [0.0] * len(branches)).expand(*shape, -1)
     high = torch.tensor([limit] * size + [n - 1e-3 for n in branches]).expand(*shape, -1)
+
     return Bounded(low.clone(), high.clone(), dtype=torch.float32)

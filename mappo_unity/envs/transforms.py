@@ -49,13 +49,19 @@ class TransformedUnityEnv(TransformedEnv):
         """Play a round; return it with its ``next`` entry, and the root of the round after it."""
         if not self._holds_own_keys(tensordict):
             return super().step_and_maybe_reset(tensordict)
+
         if tensordict.device != self.device:
             tensordict = tensordict.to(self.device)
+
         env, transform, shape = self.base_env, self.transform, self.batch_size
         actions = {n: unchecked({keys.ACTION: e.get(keys.ACTION)}, e.shape) for n, e in tensordict.items()}
+
         following = transform._call(env._step(transform._inv_call(unchecked(actions, shape))))
+
+        # only where an episode ended does the next row begin with another observation than this one ends with
         asked = transform._call(env.root()) if env.round_ended else following
         root = {name: _without_rewards(entries, self.device) for name, entries in asked.items()}
+
         tensordict.set("next", following)
         return tensordict, unchecked(root, shape, self.device)
 
@@ -67,6 +73,7 @@ class TransformedUnityEnv(TransformedEnv):
     def _holds_own_keys(self, tensordict: TensorDictBase) -> bool:
         if self._own_keys is None:
             self._own_keys = self._find_own_keys()
+
         own = self._own_keys
         if set(tensordict.keys()) != own.keys():
             return False
@@ -76,6 +83,7 @@ class TransformedUnityEnv(TransformedEnv):
         transforms = self.transform.transforms if isinstance(self.transform, Compose) else [self.transform]
         if not all(type(transform) in (Stack, CatTensors, ExcludeTransform) for transform in transforms):
             return {}
+
         beside = {keys.ACTION, keys.LOG_PROB, keys.DONE, keys.TERMINATED, keys.TRUNCATED}
         return {name: beside.union(spec.keys()) for name, spec in self.observation_spec.items()}
 
@@ -87,6 +95,7 @@ def _without_rewards(entries: TensorDictBase, device: torch.device | None) -> Te
 
 def _stack_sides(env: UnityEnv, policy: str, sides: list[str]) -> list[Transform]:
     first = env.behaviors[sides[0]].spec
+
     for side in sides[1:]:
         spec = env.behaviors[side].spec
         shapes = [o.shape for o in spec.observation_specs]
@@ -97,6 +106,7 @@ def _stack_sides(env: UnityEnv, policy: str, sides: list[str]) -> list[Transform
                 f"{expected} and {shapes}, actions {first.action_spec} and {spec.action_spec}; give them "
                 "different behavior names in Unity"
             )
+
     # S becomes the first dimension of the entry: [S, G, A, ...]
     return [Stack(in_keys=list(sides), out_key=policy, in_key_inv=policy, out_keys_inv=list(sides), dim=-3)]
 

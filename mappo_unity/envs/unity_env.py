@@ -75,6 +75,7 @@ class UnityEnv(EnvBase):
         self._limits = (max_teams, max_team_size)
         self.action_limit = float(action_limit)
         self.death_masking = death_masking
+
         self._open(seed)
         specs = make_specs(self._behaviors, self.entry_of, self.action_limit)
         self.observation_spec, self.action_spec, self.reward_spec, self.done_spec = specs
@@ -94,6 +95,7 @@ class UnityEnv(EnvBase):
         out = {name: behavior.finished for name, behavior in self._behaviors.items()}
         for behavior in self._behaviors.values():
             behavior.finished = []
+
         return out
 
     _crashed: list[CrashedEpisodes]
@@ -115,6 +117,7 @@ class UnityEnv(EnvBase):
         snapshot = getattr(self.base_env, "get_state", None)
         if snapshot is None or not hasattr(self.base_env, "set_state"):
             return None
+
         return {
             "scene": snapshot(),
             "behaviors": {name: behavior.get_state() for name, behavior in self._behaviors.items()},
@@ -127,12 +130,17 @@ class UnityEnv(EnvBase):
             ConfigError: it is of an environment with other behaviors, or more or fewer slots for agents.
         """
         self.base_env.set_state(state["scene"])
+
         saved = {name: len(entries["acting"]) for name, entries in state["behaviors"].items()}
         slots = {name: len(behavior.acting) for name, behavior in self._behaviors.items()}
+
+        # `BehaviorState.set_state` replaces arrays whole and would not notice other sizes
         if saved != slots:
             raise ConfigError(f"the snapshot has agent slots {saved}, this environment {slots}")
+
         for name, behavior in self._behaviors.items():
             behavior.set_state(state["behaviors"][name])
+
         self._untouched = True
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -155,10 +163,14 @@ class UnityEnv(EnvBase):
                 action = tensordict.get((self.entry_of[name], keys.ACTION)).reshape(len(behavior.acting), -1)
                 self.base_env.set_actions(name, behavior.actions(action.numpy(), self.action_limit))
             behavior.begin_round()
+
         self._untouched = False
         self._play_until_asked()
         self._note_crashed()
+
+        # only after `_note_crashed`, which names this round by its number
         self.rounds += 1
+
         following = {self.entry_of[name]: next_entries(b) for name, b in self._behaviors.items()}
         return unchecked(following, self.batch_size)
 
@@ -170,6 +182,8 @@ class UnityEnv(EnvBase):
         self.base_env = self._make_env(int(seed))
         self._behaviors: dict[str, BehaviorState] = {}
         self._crashed = []
+
+        # a player that is not closed here would go on running without an owner
         try:
             self.base_env.reset()
             self._first_results()
@@ -179,14 +193,18 @@ class UnityEnv(EnvBase):
         except BaseException:
             self.base_env.close()
             raise
+
         self._untouched = True
 
     def _full_reset(self) -> None:
         if self._untouched:
             return
+
         self.base_env.reset()
         for behavior in self._behaviors.values():
             behavior.forget_agents()
+
+        # the reset has already brought the first records: stepping now would lose them
         self._play_until_asked(step_first=False)
         self._untouched = True
 
@@ -249,6 +267,7 @@ class UnityEnv(EnvBase):
         for behavior in self._behaviors.values():
             if np.count_nonzero(behavior.terminated) or np.count_nonzero(behavior.truncated):
                 return True
+
         return False
 
     def root(self) -> TensorDict:

@@ -31,20 +31,25 @@ class Actor(nn.Module):
     def __init__(self, obs: ObsLayout, layout: ActionLayout, cfg: ModelConfig) -> None:
         super().__init__()
         self.encoder = Encoder(obs, cfg.normalize_obs)
+
         outputs = layout.continuous + layout.num_logits
         self.net = make_mlp(self.encoder.size, list(cfg.hidden), outputs, cfg.activation, last_gain=0.01)
+
         self.layout = layout
         self.log_std = nn.Parameter(torch.full((layout.continuous,), float(cfg.init_log_std)))
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return distribution parameters."""
         out = self.net(self.encoder(*obs))
+
         size = self.layout.continuous
         if not size:
             return out
+
         log_std = self.log_std.clamp(*LOG_STD_RANGE).expand(*out.shape[:-1], size)
         if not self.layout.branches:
             return torch.cat([out, log_std], -1)
+
         return torch.cat([out[..., :size], log_std, out[..., size:]], -1)
 
 
@@ -65,11 +70,13 @@ class PerMember(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return outputs ``[..., A, *]`` of inputs ``[..., A, *]``."""
         columns = []
+
         for member, net in enumerate(self.nets):
             if self.dims is None:
                 columns.append(net(*inputs)[..., member, :])
             else:
                 columns.append(net(*[x.select(dim, member) for x, dim in zip(inputs, self.dims)]))
+
         return torch.stack(columns, -2)
 
 
@@ -105,6 +112,7 @@ class UnityActor(ProbabilisticActor):
         with torch.no_grad():
             params = self.module[0].module(*[entries.get(key) for key in self.obs_keys])
             mask = entries.get(keys.MASK) if self.layout.branches else None
+
             dist = ActionDistribution(params, self.layout, mask)
             action = dist.sample()
             return action, dist.log_prob(action)
@@ -123,11 +131,13 @@ def make_critic(obs: ObsLayout, team_size: int, cfg: ModelConfig) -> TensorDictM
     """Build the critic over the entries of one policy name; a team of one has a local one."""
     local = team_size == 1 or cfg.critic is CriticKind.local
     in_keys = list(obs.keys) if local else [*obs.keys, keys.PRESENT, keys.DEPARTED]
+
     if cfg.share_parameters or team_size == 1:
         net = _critic(obs, team_size, cfg)
     else:
         nets = [_critic(obs, team_size, cfg) for _ in range(team_size)]
         net = PerMember(nets, obs.team_dims if local else None)
+
     return TensorDictModule(net, in_keys=in_keys, out_keys=[keys.VALUE])
 
 
@@ -145,6 +155,7 @@ class JointPolicy(TensorDictModuleBase):
     def __init__(self, actors: dict[str, TensorDictModuleBase]) -> None:
         super().__init__()
         self.actors = nn.ModuleDict({str(i): actor for i, actor in enumerate(actors.values())})
+
         self.names = list(actors)
         self.inputs = [[str(k) for k in actor.in_keys] for actor in actors.values()]
         self.in_keys = [(name, k) for name, inputs in zip(self.names, self.inputs) for k in inputs]
@@ -153,6 +164,7 @@ class JointPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write every name's action and log-probability beside its observation."""
         draws = exploration_type() in (None, ExplorationType.RANDOM) and not torch.is_grad_enabled()
+
         for name, inputs, actor in zip(self.names, self.inputs, self.actors.values()):
             entries = tensordict.get(name)
             if draws and isinstance(actor, UnityActor):
@@ -160,6 +172,8 @@ class JointPolicy(TensorDictModuleBase):
             else:
                 out = actor(entries.select(*inputs, strict=False))
                 action, log_prob = out.get(keys.ACTION), out.get(keys.LOG_PROB)
+
             entries.set(keys.ACTION, action)
             entries.set(keys.LOG_PROB, log_prob)
+
         return tensordict

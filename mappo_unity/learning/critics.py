@@ -65,16 +65,21 @@ class PooledCritic(nn.Module):
         super().__init__()
         self.encoder = Encoder(obs, cfg.normalize_obs)
         first, *rest = list(cfg.critic_hidden or cfg.hidden)
+
+        # attention wants a width that its heads divide
         first += -first % ATTENTION_HEADS
         self.team_size = team_size
+
         self.token = nn.Sequential(
             linear(self.encoder.size + 1, first, 2**0.5), ACTIVATIONS[cfg.activation]()
         )
+
         self.attention = (
             nn.MultiheadAttention(first, ATTENTION_HEADS, batch_first=True)
             if cfg.critic is CriticKind.attention
             else None
         )
+
         self.net = make_mlp(2 * first + 1, rest or [first], 1, cfg.activation, last_gain=CRITIC_GAIN)
 
     def forward(self, *inputs: Tensor) -> Tensor:
@@ -82,10 +87,12 @@ class PooledCritic(nn.Module):
         features, seen = seen_features(self.encoder, inputs)
         tokens = self.token(torch.cat([features, seen], -1))
         count = seen.sum(-2, keepdim=True)
+
         if self.attention is None:
             pooled = ((tokens * seen).sum(-2, keepdim=True) / count.clamp_min(1.0)).expand_as(tokens)
         else:
             pooled = self._attend(tokens, seen)
+
         share = (count / self.team_size).expand(*tokens.shape[:-1], 1)
         return self.net(torch.cat([tokens, pooled, share], -1))
 
@@ -94,6 +101,7 @@ class PooledCritic(nn.Module):
         rows = tokens.flatten(0, -3)
         hidden = seen.flatten(0, -3).squeeze(-1) == 0
         hidden = hidden & ~hidden.all(-1, keepdim=True)  # a team of nobody attends to zeros, not to nothing
+
         out, _ = self.attention(rows, rows, rows, key_padding_mask=hidden, need_weights=False)
         return out.view_as(tokens)
 

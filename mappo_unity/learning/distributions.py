@@ -60,25 +60,32 @@ class ActionLayout:
         """Turn branch indices ``[..., K]`` into indices of the categoricals ``[..., K or 1]``."""
         if not self.joint:
             return branches
+
+        # branches are the digits of one number, the first the highest
         index = torch.zeros_like(branches[..., 0])
         for column, size in enumerate(self.branches):
             index = index * size + branches[..., column]
+
         return index.unsqueeze(-1)
 
     def to_branches(self, categories: Tensor) -> Tensor:
         """Turn indices of the categoricals ``[..., K or 1]`` into branch indices ``[..., K]``."""
         if not self.joint:
             return categories
+
         index, columns = categories[..., 0], []
         for size in reversed(self.branches):
             columns.append(index % size)
             index = index // size
+
         return torch.stack(columns[::-1], -1)
 
     def joint_mask(self, mask: Tensor) -> Tensor:
         """Turn masks of branches ``[..., sum]`` into masks of the categoricals."""
         if not self.joint:
             return mask
+
+        # a combination is allowed where all its parts are
         first, *rest = mask.split(list(self.branches), -1)
         for part in rest:
             first = (first.unsqueeze(-1) & part.unsqueeze(-2)).flatten(-2)
@@ -110,6 +117,7 @@ class ActionDistribution(Distribution):
         with torch.no_grad():
             if not self.layout.branches:
                 return self._sample_continuous(sample_shape)
+
             categories = torch.stack([self._sample_category(p, sample_shape) for p in self.log_probs], -1)
             return self._join(self._sample_continuous(sample_shape), self.layout.to_branches(categories))
 
@@ -134,9 +142,11 @@ class ActionDistribution(Distribution):
         total = torch.zeros(()) if not size else self._continuous_log_prob(value[..., :size])
         if not self.log_probs:
             return total
+
         categories = self.layout.to_categories(value[..., size:].long())
         for column, log_probs in enumerate(self.log_probs):
             total = total + log_probs.gather(-1, categories[..., column : column + 1]).squeeze(-1)
+
         return total
 
     def entropy(self) -> Tensor:
@@ -144,13 +154,16 @@ class ActionDistribution(Distribution):
         total = torch.zeros(())
         if self.layout.continuous:
             total = (self.log_std + 0.5 + _LOG_SQRT_2PI).sum(-1)
+
         for log_probs in self.log_probs:
             total = total - (log_probs.exp() * log_probs).sum(-1)
+
         return total
 
     def _categoricals(self, logits: Tensor, mask: Tensor | None) -> list[Tensor]:
         if mask is not None:
             logits = logits.masked_fill(~self.layout.joint_mask(mask), torch.finfo(logits.dtype).min / 4)
+
         return [part.log_softmax(-1) for part in logits.split(list(self.layout.categoricals), -1)]
 
     def _continuous_log_prob(self, value: Tensor) -> Tensor:

@@ -41,6 +41,7 @@ class ObsLayout:
                     f"sensor obs_{index} has shape {tuple(shape)}; vectors (1 dimension) and images or grids "
                     "(3 dimensions) can be learned from, variable-length buffers cannot yet"
                 )
+
         images = [(keys.SENSOR.format(i), tuple(s)) for i, s in enumerate(shapes) if len(s) == 3]
         return cls(sum(s[0] for s in shapes if len(s) == 1), tuple(images))
 
@@ -89,9 +90,11 @@ class RunningNorm(nn.Module):
         if not len(rows):
             return
         count = self.count + len(rows)
+
         weight = float(len(rows) / count)
         delta = rows.mean(0) - self.mean
         var = self.var * (1 - weight) + rows.var(0, unbiased=False) * weight
+
         self.var.copy_(var + delta**2 * weight * (1 - weight))
         self.mean.add_(delta * weight)
         self.count.copy_(count)
@@ -112,6 +115,7 @@ class Encoder(nn.Module):
         """Return features; the arguments come in the order of `ObsLayout.keys`."""
         if not len(self.images):
             return self.norm(obs[0])
+
         parts = [self.norm(obs[0])] if self.has_vector else []
         images = obs[1:] if self.has_vector else obs
         return torch.cat(parts + [net(image) for net, image in zip(self.images, images)], -1)
@@ -128,6 +132,7 @@ class ImageEncoder(nn.Module):
         super().__init__()
         self.channels_last = shape[2] < shape[0]
         channels, height, width = (shape[2], *shape[:2]) if self.channels_last else shape
+
         if min(height, width) >= 20:
             convolutions = [nn.Conv2d(channels, 16, 8, 4), nn.SiLU(), nn.Conv2d(16, 32, 4, 2), nn.SiLU()]
         else:
@@ -137,7 +142,10 @@ class ImageEncoder(nn.Module):
                 nn.Conv2d(16, 32, 3, 2, 1),
                 nn.SiLU(),
             ]
+
         self.conv = nn.Sequential(*convolutions, nn.Flatten())
+
+        # the size of the features is asked of the convolutions themselves
         with torch.no_grad():
             flat = self.conv(torch.zeros(1, channels, height, width)).shape[1]
         self.out = nn.Sequential(nn.Linear(flat, IMAGE_FEATURES), nn.SiLU())

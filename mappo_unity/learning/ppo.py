@@ -51,12 +51,15 @@ class PolicyLearner:
         self.params = [*actor.parameters(), *critic.parameters()]
         self.optimizer = make_optimizer(self.params, cfg)
         self.value_norm = ValueNorm(cfg.value_norm_beta, cfg.normalize_values is not ValueNormKind.none)
+
         self.critic_keys = [str(key) for key in critic.in_keys]
         self.value_layers = [m for m in critic.modules() if isinstance(m, nn.Linear) and m.out_features == 1]
         inputs = [*(str(key) for key in actor.in_keys), *self.critic_keys]
         self.row_keys = list(dict.fromkeys([*inputs, keys.ACTION, keys.LOG_PROB]))
+
         self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
+
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(max_rows),
             sampler=SamplerWithoutReplacement(),
@@ -84,10 +87,12 @@ class PolicyLearner:
         lr = scheduled(cfg.lr_schedule, cfg.lr, cfg.lr_final, progress)
         clip = scheduled(cfg.clip_schedule, cfg.clip_epsilon, cfg.clip_epsilon_final, progress)
         entropy = scheduled(cfg.entropy_schedule, cfg.entropy_coef, cfg.entropy_coef_final, progress)
+
         for group in self.optimizer.param_groups:
             group["lr"] = lr
         self.loss.clip_epsilon.fill_(clip)
         self.loss.entropy_coeff.fill_(entropy)
+
         return {"lr": lr, "clip_epsilon": clip, "entropy_coef": entropy}
 
     @torch.no_grad()
@@ -95,6 +100,7 @@ class PolicyLearner:
         """Add advantages and targets; return the team rows ``[R, A]`` in which anybody learns."""
         following = batch.get("next")
         acting, truncated = batch.get(keys.ACTING), following.get(keys.TRUNCATED)
+
         value = self._values(batch)
         estimate = masked_gae(
             self.cfg.reward_weight * following.get(keys.REWARD)
@@ -109,15 +115,20 @@ class PolicyLearner:
             gamma=self.cfg.gamma,
             gae_lambda=self.cfg.gae_lambda,
         )
+
         learns = estimate.known & acting
         metrics = {
             "explained_variance": float(explained_variance(value, estimate.target, learns)),
             "value_mean": float(masked_mean(value, learns)),
         }
+
+        # `value` was denormalised above, and is normalised below: the statistics move in between
         self._move_value_norm(estimate.target[estimate.known])
+
         advantage = (
             normalize(estimate.advantage, learns) if self.cfg.normalize_advantages else estimate.advantage
         )
+
         entries = {key: batch.get(key) for key in self.row_keys}
         entries |= {keys.ADVANTAGE: advantage, keys.VALUE_TARGET: self.value_norm.normalize(estimate.target)}
         entries |= {
@@ -125,6 +136,8 @@ class PolicyLearner:
             CRITIC_LEARNS: estimate.known,
             keys.VALUE: self.value_norm.normalize(value),
         }
+
+        # rows without an action to learn from would only dilute the minibatches
         rows = TensorDict(entries, batch.batch_size).flatten(0, -2)
         used = learns.flatten(0, -3).any(-2).squeeze(-1)
         return (rows if bool(used.all()) else rows[used]), metrics
@@ -146,6 +159,7 @@ class PolicyLearner:
         self.value_norm.update(returns)
         if self.cfg.normalize_values is not ValueNormKind.popart:
             return
+
         new_mean, new_std = self.value_norm.statistics()
         for layer in self.value_layers:
             layer.weight.mul_(std / new_std)
@@ -155,16 +169,21 @@ class PolicyLearner:
         """Values of terminal observations of cut episodes, 0 elsewhere."""
         out = torch.zeros(truncated.shape, device=truncated.device)
         where = truncated.flatten(0, -3).any(-2).squeeze(-1)
+
+        # the critic is asked only about rows that need it
         if where.any():
             rows = following.select(*self.critic_keys).flatten(0, -2)[where]
             out.flatten(0, -3)[where] = self._values(rows)
+
         return out
 
     def _update(self, rows: TensorDictBase) -> dict[str, float]:
         """Run the epochs; take everything back if a number is not finite or the KL explodes."""
         before = copy.deepcopy(self._trainable_state())
+
         self.buffer.empty()
         self.buffer.extend(rows)
+
         sums: dict[str, Tensor] = {}
         steps, kl_epoch, stopped = 0, 0.0, False
         for _ in range(self.cfg.epochs):
@@ -174,18 +193,23 @@ class PolicyLearner:
                 sums = {k: v + sums.get(k, 0.0) for k, v in terms.items()}
                 kls.append(terms["kl"])
                 steps += 1
+
+            # one look at the KL an epoch: every look waits for the device
             kl_epoch = float(torch.stack(kls).mean())
             if not math.isfinite(kl_epoch) or kl_epoch > self.cfg.max_kl:
                 break
             if self.cfg.target_kl is not None and kl_epoch > self.cfg.target_kl:
                 stopped = True
                 break
+
         metrics = {name: float(value) / steps for name, value in sums.items()}
         healthy = all(math.isfinite(v) for v in metrics.values()) and self._weights_finite()
+
         self.updates += 1
         if not healthy or kl_epoch > self.cfg.max_kl:
             self._load_trainable(before)
             self.rollbacks += 1
+
         rolled = {"rolled_back": float(not healthy or kl_epoch > self.cfg.max_kl)}
         return (
             metrics
@@ -196,15 +220,18 @@ class PolicyLearner:
     def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         losses = self.loss(minibatch)
         total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+
         self.optimizer.zero_grad()
         total.backward()
         grad_norm = nn.utils.clip_grad_norm_(self.params, self.cfg.max_grad_norm, foreach=True)
         self.optimizer.step()
+
         with torch.no_grad():
             mask, log_ratio = minibatch.get(ACTOR_LEARNS), self.loss.log_ratio
             # k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative
             kl = masked_mean(torch.where(mask, log_ratio.exp() - 1 - log_ratio, 0.0), mask)
             clipped = masked_mean((log_ratio.exp() - 1).abs() > self.loss.clip_epsilon, mask)
+
         return {
             "policy_loss": losses["loss_objective"].detach(),
             "value_loss": losses["loss_critic"].detach(),

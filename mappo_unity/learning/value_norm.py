@@ -38,6 +38,8 @@ class ValueNorm(nn.Module):
         """Take returns ``[n]`` into the averages."""
         if not self.enabled or not returns.numel():
             return
+
+        # in float64: a difference of two averages of squares loses digits
         returns = returns.double()
         self.mean.mul_(self.beta).add_(float(returns.mean()) * (1 - self.beta))
         self.mean_sq.mul_(self.beta).add_(float((returns**2).mean()) * (1 - self.beta))

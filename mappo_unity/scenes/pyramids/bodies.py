@@ -62,13 +62,16 @@ class PyramidsBodies:
         self.velocity = np.zeros((num_areas, 3))
         self.drive = np.zeros((num_areas, 3))
         self.yaw = np.zeros(num_areas)
+
         self.switch_position = np.full((num_areas, 3), 1e3)
         self.switch_fall = np.zeros(num_areas)
         self.switch_yaw = np.zeros(num_areas)
         self.switch_spin = np.zeros(num_areas)
+
         self.stone_root = np.zeros((num_areas, NUM_STONES, 2))
         self.age = np.zeros(num_areas, np.int64)
         self._shift = np.zeros((num_areas, 3))
+
         # Boxes along the axes that stop an agent, x, z: inner walls, then the lowest layer of the stones.
         self._half = np.concatenate(
             [INNER_WALLS[:, [3, 5]], np.tile(STONE_LAYERS[0, [3, 5]], (NUM_STONES, 1))]
@@ -82,10 +85,12 @@ class PyramidsBodies:
         self.position[areas, ::2] = spots[:, 0]
         self.velocity[areas] = 0.0
         self.yaw[areas] = yaw
+
         self.switch_position[areas, 1] = SPAWN_Y + SWITCH_HALF[1]
         self.switch_position[areas, ::2] = spots[:, 1]
         self.switch_fall[areas] = 0.0
         self.switch_yaw[areas] = 0.0  # its spin stays
+
         self.stone_root[areas] = spots[:, 2:]
         self._block[areas, len(INNER_WALLS) :] = spots[:, 2:] + STONE_LAYERS[0, [0, 2]]
         self.age[areas] = 0
@@ -117,6 +122,8 @@ class PyramidsBodies:
         velocity += self.drive
         velocity[:, 1] -= GRAVITY * TICK_S
         velocity *= DRAG_KEPT
+
+        # what is solved later has the last word, so the outer walls come last
         self._shift[:] = 0.0
         self._ground()
         touching = self._switch()
@@ -149,12 +156,16 @@ class PyramidsBodies:
         gap = self.position[:, 1] - AGENT_HALF[1]
         taken = np.maximum(-velocity[:, 1] - np.maximum(gap, 0.0) / TICK_S, 0.0)
         taken[gap >= CONTACT_GAP] = 0.0
+
+        # friction goes by the impulse with which the floor stops the fall
         velocity[:, 1] += taken
         slide(velocity, taken)
         self._shift[:, 1] = push_out(gap)
+
         height = self.switch_position[:, 1] - SWITCH_HALF[1]
         self.switch_fall -= GRAVITY * TICK_S
         self.switch_fall[:] = np.maximum(self.switch_fall, -height / TICK_S)  # lands exactly
+
         spin = self.switch_spin
         spin *= SPIN_KEPT
         loss = np.where(height < CONTACT_GAP, SPIN_LOSS, 0.0)
@@ -167,18 +178,22 @@ class PyramidsBodies:
             offset[:, 0] ** 2 + offset[:, 2] ** 2
             < (np.hypot(2.0, 2.0) + np.hypot(0.5, 0.5) + CONTACT_GAP) ** 2
         )
+
         touching = np.zeros(len(near), bool)
         areas = np.flatnonzero(near)
         if not areas.size:
             return touching
+
         offset, yaw, turn = offset[areas], self.yaw[areas], self.switch_yaw[areas]
         offset[:, 1] = 0.0
         gap, normal = box_gap(offset, yaw, AGENT_HALF, (SWITCH_HALF[0], TALL, SWITCH_HALF[2]), turn)
+
         rows = np.flatnonzero(gap < CONTACT_GAP)
         if rows.size:
             touching[areas[rows]] = True
             lever = contact_point(offset[rows], yaw[rows], turn[rows], normal[rows])
             self._turn_switch(areas[rows], gap[rows], normal[rows], lever)
+
         return touching
 
     def _turn_switch(self, areas: np.ndarray, gap: np.ndarray, normal: np.ndarray, lever: np.ndarray) -> None:
@@ -193,6 +208,7 @@ class PyramidsBodies:
         velocity = self.velocity[areas]
         approach = np.maximum(gap, 0.0) / TICK_S
         limit = np.full(len(areas), np.inf)
+
         for axis in (flat, along):  # first the impulse along the normal, then friction, limited by it
             arm = axis[:, 0] * lever[:, 1] - axis[:, 1] * lever[:, 0]
             mobility = (axis**2).sum(axis=1) / MASS + arm**2 / SWITCH_INERTIA
@@ -204,6 +220,7 @@ class PyramidsBodies:
                 impulse = np.clip(-speed / np.maximum(mobility, 1e-9), -limit, limit)
             velocity[:, ::2] += axis * (impulse / MASS)[:, None]
             spin -= arm * impulse / SWITCH_INERTIA
+
         self.velocity[areas] = velocity
         self.switch_spin[areas] = spin
         self._shift[areas] += push_out(gap)[:, None] * normal
@@ -216,11 +233,13 @@ class PyramidsBodies:
         areas, blocks = np.nonzero((np.abs(beside) < reach).all(axis=2))
         if not areas.size:
             return
+
         offset = np.zeros((len(areas), 3))
         offset[:, ::2] = beside[areas, blocks]
         half = np.full((len(areas), 3), TALL)
         half[:, ::2] = self._half[blocks]
         gap, normal = box_gap(offset, self.yaw[areas], AGENT_HALF, half)
+
         first = np.r_[True, areas[1:] != areas[:-1]]
         rank = np.arange(len(areas)) - np.flatnonzero(first)[np.cumsum(first) - 1]
         for number in range(rank.max() + 1):  # an agent in a corner has several: in turns
@@ -229,6 +248,7 @@ class PyramidsBodies:
     def _walls(self) -> None:
         """Stop agents at the outer walls, which have the last word."""
         extents = plan_extent(self.yaw, AGENT_HALF)
+
         for axis, extent, (low, high) in zip((0, 2), extents, (INSIDE_X, INSIDE_Z), strict=True):
             side = self.position[:, axis]
             for sign, face in ((1.0, low), (-1.0, high)):
@@ -258,6 +278,7 @@ def contact_point(offset: np.ndarray, yaw: np.ndarray, turn: np.ndarray, normal:
     along = np.stack([flat[:, 1], -flat[:, 0]], axis=1)
     agent = _corners(yaw, AGENT_HALF[0]) + offset[:, None, ::2]
     switch = _corners(turn, SWITCH_HALF[0])
+
     low, high = [], []
     for corners, side in ((agent, -1.0), (switch, 1.0)):
         outward = side * np.einsum("nci,ni->nc", corners, flat)
@@ -265,6 +286,7 @@ def contact_point(offset: np.ndarray, yaw: np.ndarray, turn: np.ndarray, normal:
         edge = outward >= outward.max(axis=1, keepdims=True) - FLUSH
         low.append(np.where(edge, across, np.inf).min(axis=1))
         high.append(np.where(edge, across, -np.inf).max(axis=1))
+
     middle = 0.5 * (np.maximum(*low) + np.minimum(*high))
     depth = np.einsum("nci,ni->nc", switch, flat).max(axis=1)
     return flat * depth[:, None] + along * middle[:, None]

@@ -58,6 +58,7 @@ class PyramidsBricks:
         start = _AGENT_JOINTS
         self.bodies = self._physics.qpos[:, start:].reshape(num_areas, NUM_BODIES, 7)  # x y z, w x y z
         self._speeds = self._physics.qvel[:, start:].reshape(num_areas, NUM_BODIES, 6)
+
         self.mode = np.full(num_areas, ABSENT)
         self.clock = np.zeros(num_areas, np.int64)
         self.root = np.zeros((num_areas, 2))
@@ -69,10 +70,12 @@ class PyramidsBricks:
         poses, speeds = [], []
         alone.qpos[0, :2] = 40.0  # the agent, far away
         alone.qpos[0, _AGENT_JOINTS:] = _spawned().ravel()
+
         for _ in range(FALL_TICKS):
             alone.step(SUBSTEPS)
             poses.append(alone.qpos[0, _AGENT_JOINTS:].reshape(NUM_BODIES, 7).copy())
             speeds.append(alone.qvel[0, _AGENT_JOINTS:].reshape(NUM_BODIES, 6).copy())
+
         return np.array(poses), np.array(speeds)
 
     def surround(self, areas: np.ndarray, stone_root: np.ndarray) -> None:
@@ -85,9 +88,12 @@ class PyramidsBricks:
         self.bodies[areas] = _spawned()
         self.bodies[areas, :, 0] += root[:, :1]
         self.bodies[areas, :, 2] += root[:, 1:]
+
         self._speeds[areas] = 0.0
         self.root[areas] = root
         self.clock[areas] = 0
+
+        # the recording fell on a free floor: at an inner wall the pile has to be computed
         self.mode[areas] = np.where(_clear_of_walls(root), FALLING, AWAKE)
 
     def remove(self, areas: np.ndarray) -> None:
@@ -122,23 +128,31 @@ class PyramidsBricks:
         """
         self._replay()
         goal = np.zeros(len(self.mode), bool)
+
         areas = np.flatnonzero(self.mode == AWAKE)
         if not areas.size:
             return goal
+
         physics = self._physics
         physics.qpos[areas, 0], physics.qpos[areas, 1] = position[areas, 0], position[areas, 2]
         physics.qpos[areas, 2] = yaw[areas]
         physics.qvel[areas, 0], physics.qvel[areas, 1] = velocity[areas, 0], velocity[areas, 2]
         physics.qvel[areas, 2] = 0.0
+
         physics.mocap_pos[areas, 0] = switch[0][areas]
         physics.mocap_quat[areas, 0, 0] = np.cos(0.5 * switch[1][areas])
         physics.mocap_quat[areas, 0, 2] = np.sin(0.5 * switch[1][areas])
+
         self._limit_spin(areas)
         physics.step(SUBSTEPS, areas)
+
+        # the pile may have slowed the agents down
         position[areas, 0], position[areas, 2] = physics.qpos[areas, 0], physics.qpos[areas, 1]
         velocity[areas, 0], velocity[areas, 2] = physics.qvel[areas, 0], physics.qvel[areas, 1]
+
         distance = physics.substep_sensors()[:, :, 0].min(axis=1)  # the goal may be thrown clear in the tick
         goal[areas] = distance < CONTACT_GAP
+
         self._rest(areas)
         return goal
 
@@ -161,6 +175,7 @@ class PyramidsBricks:
             self.bodies[areas] = poses[tick]
             self.bodies[areas, :, 0] += self.root[areas, :1]
             self.bodies[areas, :, 2] += self.root[areas, 1:]
+
             self._speeds[areas] = speeds[tick]
             self.clock[areas] += 1
             self._sleep(areas[tick + 1 == FALL_TICKS])
@@ -186,11 +201,15 @@ class PyramidsBricks:
     ) -> np.ndarray:
         """Return in which of `areas` [n] an agent or a turning switch may touch a body within a tick."""
         place = self.bodies[areas, :, :3]
+
+        # the reach takes in the agent's way in this tick
         speed = np.sqrt((velocity[areas] ** 2).sum(axis=1))
         reach = RADII + (AGENT_RADIUS + MARGIN + speed * TICK_S)[:, None]
         near = ((place - position[areas, None]) ** 2).sum(axis=2) < reach**2
+
         turning = (switch_spin[areas] != 0)[:, None]
         beside = ((place - switch_position[areas, None]) ** 2).sum(axis=2)
+
         return (near | (turning & (beside < (RADII + SWITCH_RADIUS + MARGIN) ** 2))).any(axis=1)
 
     def _limit_spin(self, areas: np.ndarray) -> None:
@@ -226,6 +245,7 @@ def _area_spec() -> mujoco.MjSpec:
     walls = "".join(_box("", *wall) for wall in INNER_WALLS)
     layers = "".join(_box("", x, rest_y, z, hx, hy, hz) for x, _, z, hx, hy, hz, rest_y in STONE_LAYERS)
     stones = "".join(f'<body mocap="true" pos="0 -50 0">{layers}</body>' for i in range(6))
+
     faces = (
         (INSIDE_X[0], 0, "1 0 0"),
         (INSIDE_X[1], 0, "-1 0 0"),
@@ -240,6 +260,7 @@ def _area_spec() -> mujoco.MjSpec:
         f'<body><freejoint/><geom class="loose" type="box" size="{h} {h} {h}" mass="2" name="{name}"/></body>'
         for name, h in [*((f"brick{i}", 0.5) for i in range(len(BRICKS))), ("goal", 1.0)]
     )
+
     return mujoco.MjSpec.from_string(f"""
 <mujoco>
   <option timestep="{TICK_S / SUBSTEPS}" gravity="0 -9.81 0" solver="Newton" cone="pyramidal"/>

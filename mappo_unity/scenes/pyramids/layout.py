@@ -33,14 +33,17 @@ OUTER_WALLS = np.array(
 def _inner_walls() -> np.ndarray:
     y, half_y = 0.91, 3.61  # from -2.7 to 4.52
     boxes = []
+
     for x in (-16.55, 16.55):
         for z in (-16.56, 16.56):
             boxes.append([x, y, z, 7.575, half_y, 0.5])  # a cross
             boxes.append([x, y, z, 0.5, half_y, 7.5])
+
     for side in (-42.25, 42.25):
         for along in (-16.5, 16.5):
             boxes.append([side, y, along, 7.25, half_y, 0.5])
             boxes.append([along, y, side, 0.5, half_y, 7.25])
+
     return np.array(boxes)
 
 
@@ -54,11 +57,14 @@ def _cubes(
     ring_8: tuple[float, tuple[float, ...]], four: tuple[float, tuple[float, ...]], top: tuple
 ) -> np.ndarray:
     ring = [(x, 0.151, z) for x in _RING_X for z in _RING_Z if x in (-1.34, 2.2) or z in (-1.06, 2.62)]
+
     y, xs = ring_8
     zs = (-0.473, 0.771, 2.121)
     ring += [(x, y, z) for x in xs for z in zs if not (x == xs[1] and z == zs[1])]
+
     y, xs = four
     ring += [(x, y, z) for x in xs for z in (0.131, 1.375)]
+
     return np.array([*ring, top])
 
 
@@ -78,6 +84,7 @@ def _stone_layers() -> np.ndarray:
         low, high = STONES[cubes].min(axis=0) - 0.5, STONES[cubes].max(axis=0) + 0.5
         rest_y = 0.5 + number
         rows.append([*(0.5 * (low + high)), *(0.5 * (high - low)), rest_y])
+
     return np.array(rows)
 
 

@@ -57,10 +57,13 @@ class Pyramids(Scene):
         zones = self.rng.permuted(np.tile(np.arange(len(ZONES)), (len(slots), 1)), axis=1)
         spots = ZONES[zones] + self.rng.uniform(-ZONE_RANGE, ZONE_RANGE, (*zones.shape, 2))
         yaw = np.radians(self.rng.integers(0, 360, len(slots)))
+
+        # the third zone is kept for the brick pyramid, which appears when the switch is pressed
         self.brick_spot[slots] = spots[:, 2]
         self.bodies.place(slots, np.delete(spots, 2, axis=1), yaw)
         self.bricks.remove(slots)
         self.bricks.surround(slots, spots[:, 3:])
+
         self.switch_on[slots] = False
 
     def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
@@ -80,14 +83,18 @@ class Pyramids(Scene):
         """Move all bodies by one tick; a touched switch goes on, a touched goal ends the episode."""
         bodies, bricks = self.bodies, self.bricks
         pressed = bodies.solve() & ~self.switch_on
+
+        # where a pile is awake the bricks' engine moves the agent, too; `move` leaves their x and z alone
         awake = bricks.wake(bodies.position, bodies.velocity, bodies.switch_position, bodies.switch_spin)
         switch = (bodies.switch_position, bodies.switch_yaw)
         goal = bricks.step(bodies.position, bodies.velocity, bodies.yaw, switch)
         bodies.move(awake)
+
         if pressed.any():
             areas = np.flatnonzero(pressed)
             self.switch_on[areas] = True
             bricks.appear(areas, self.brick_spot[areas])
+
         if goal.any():
             self.set_reward(goal, GOAL_REWARD)
             self.end_episode(goal)

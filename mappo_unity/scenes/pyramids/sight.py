@@ -49,15 +49,20 @@ def see(
     casts = [eyes.casts(bodies.position[areas], bodies.yaw[areas]) for eyes in EYES]
     origin = casts[0][0][:, 0, 0]  # [n, 3]: all start at the agent's centre
     direction = np.concatenate([cast[1] for cast in casts], axis=1)[:, :, 0]  # [n, R, 3]
+
     distance = np.full((*direction.shape[:2], len(_TAGS)), np.inf)
     _cast_upright(bodies, areas, origin, direction, distance)
+
     piles = np.flatnonzero(bricks.present[areas])
     if piles.size:
         distance[piles, :, -NUM_BODIES:] = _cast_cubes(
             bricks.bodies[areas[piles]], origin[piles], direction[piles]
         )
+
+    # a switch's tag says whether it is on; the other tags never change
     tags = np.tile(_TAGS, (len(areas), 1))
     tags[:, _NUM_STILL] = np.where(switch_on[areas], SWITCH_ON_TAG, SWITCH_OFF_TAG)
+
     ends = np.cumsum([eyes.num_rays for eyes in EYES])
     return [
         eyes.encode(distance[:, end - eyes.num_rays : end], tags)
@@ -71,12 +76,16 @@ def _cast_upright(
     """Write the travel to walls, stones and switches into `distance` [n, R, M]."""
     centre = np.empty((len(areas), _NUM_STILL + 1, 3))
     centre[:, :_NUM_WALLS] = _WALL_CENTRES
+
     stones = centre[:, _NUM_WALLS:_NUM_STILL].reshape(len(areas), NUM_STONES, len(STONE_LAYERS), 3)  # a view
     stones[..., ::2] = bodies.stone_root[areas][:, :, None] + STONE_LAYERS[:, [0, 2]]
     stones[..., 1] = bodies.stone_heights(areas)[:, None]
+
     centre[:, _NUM_STILL] = bodies.switch_position[areas]
     yaw = np.zeros(centre.shape[:2])
     yaw[:, _NUM_STILL] = bodies.switch_yaw[areas]
+
+    # most rays pass most boxes by: only the others are cast
     agent, ray, box = np.nonzero(_passes_plan(origin, direction, centre))
     distance[agent, ray, box] = cast_upright_boxes(
         origin[agent],
@@ -99,12 +108,15 @@ def _passes_plan(origin: np.ndarray, direction: np.ndarray, centre: np.ndarray) 
 def _cast_cubes(poses: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return the travel [m, R, B] to the cubes of piles, `poses` [m, B, 7] (x y z, quaternion w first)."""
     distance = np.full((*direction.shape[:2], NUM_BODIES), np.inf)
+
     reach = np.sqrt((HALVES**2).sum(axis=1)) + _RADIUS.max()
     near = passes(origin[:, None, None], direction[:, :, None], poses[:, None, :, :3], reach)
     agent, ray, cube = np.nonzero(near)
+
     turn = poses[agent, cube, 3:]
     local = _into_frame(turn, origin[agent] - poses[agent, cube, :3])
     ahead = _into_frame(turn, direction[agent, ray])
+
     distance[agent, ray, cube] = cast_boxes(local, ahead, _RADIUS[ray], HALVES[cube], CONTACT_GAP)
     return distance
 

@@ -37,10 +37,13 @@ def cast_discs(towards: np.ndarray, outside: np.ndarray, direction: np.ndarray) 
     """
     ahead = towards[0] * direction[0]
     ahead += towards[1] * direction[1]
+
     root = ahead * ahead
     root -= outside
+
     with np.errstate(invalid="ignore"):
         np.sqrt(root, out=root)
+
     return np.subtract(ahead, root, out=root)
 
 
@@ -54,12 +57,16 @@ class Walls:
     def __init__(self, begin: np.ndarray, end: np.ndarray, radius: float) -> None:
         """`radius` of the cast disc, m."""
         length = np.sqrt(((end - begin) ** 2).sum(axis=1, keepdims=True))
+
         along = (end - begin) / length
         front = np.stack([along[:, 1], -along[:, 0]], axis=1)
+
         self._radius, self._half = radius, length / 2  # [P, 1]
+
         # matrix products are several times as fast as products of columns with rows. Places along a wall are
         # in halves of its length
         self._axes = np.concatenate([front, along / self._half])  # [2 P, 2]
+
         middle = np.tile((begin + end) / 2, (2, 1))
         self._zero = (self._axes * middle).sum(axis=1, keepdims=True)
         self._zero[: len(begin)] += radius
@@ -78,6 +85,7 @@ class Walls:
         """Return which walls, ends included, are nearer than `gap` to casters at `places`, bool [P, n]."""
         before = places[0] + self._radius
         beyond = np.maximum(np.abs(places[1]) - 1.0, 0.0) * self._half
+
         touched: np.ndarray = before * before + beyond * beyond < (self._radius + gap) ** 2
         return touched
 
@@ -88,12 +96,15 @@ class Walls:
         disc overlaps; `direction` [2, R]: unit vectors.
         """
         receding, slope = (self._axes @ direction).reshape(places.shape)
+
         with np.errstate(divide="ignore", invalid="ignore"):
             travel = np.divide(places[0], receding, out=receding)
             np.negative(travel, out=travel)
             slope *= travel
+
         slope += places[1]
         np.putmask(travel, np.abs(slope, out=slope) > 1.0, np.nan)
+
         return travel
 
 
@@ -113,5 +124,6 @@ def first_met(travel: np.ndarray, number: np.ndarray) -> np.ndarray:
     """
     bits = np.bitwise_and(travel.view(np.uint64), ~_NUMBER_BITS)
     bits |= number
+
     first: np.ndarray = np.minimum.reduce(bits, axis=0) & _NUMBER_BITS
     return first.view(np.int64)

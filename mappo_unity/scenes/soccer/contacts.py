@@ -46,6 +46,7 @@ class Bodies:
         self.num_balls = num_balls
         self.velocity = np.zeros((2, num))
         self.spin = np.zeros(num)
+
         # inverse mass; that of rubbing, which also turns a ball, a solid sphere: 1/m + r^2 / (2/5 m r^2);
         # lever from centre to contact; spin gained by rubbing: r / (2/5 m r^2). Agents do not turn.
         self.constants = np.zeros((4, num))
@@ -54,6 +55,7 @@ class Bodies:
             :, None
         ]
         self.constants[:, -1] = 0
+
         # the velocities one after another, and at the same places the inverse masses that weigh impulses
         self.flat_velocity = self.velocity.reshape(-1)
         self.flat_weight = np.tile(self.constants[0], 2)
@@ -73,6 +75,7 @@ class Solved:
         self._all = _Rows(bodies, contacts, tick_s)
         shared = _shared(contacts, len(bodies.spin) - 1)
         self._alone, self._ranks = self._all, []
+
         if shared is not None:
             self._alone = self._all.part(np.flatnonzero(~shared))
             self._ranks = [self._all.part(rank) for rank in _ranks(contacts, shared, bodies.num_balls)]
@@ -81,6 +84,7 @@ class Solved:
         """Iterate once over contacts that share no body, up to six times over the others."""
         if self._alone.mass.size:
             iterate(self._alone)
+
         for _ in range(ITERATIONS if self._ranks else 0):
             if max([np.abs(iterate(rank)).max() for rank in self._ranks]) < _SETTLED:
                 break
@@ -94,20 +98,26 @@ class Solved:
         flat = moves.reshape(-1)
         self._all.aim(share, most)
         _, short = self._all.missing(flat)
+
         if not np.count_nonzero(short > _ZERO):
             return
+
         for part in (self._alone, *self._ranks) if self._ranks else ():  # those are copies
             part.aim(share, most)
+
         self.repeat(lambda part: part.push(flat))
 
 
 def _shared(contacts: Contacts, pitch: int) -> np.ndarray | None:
     """Return which contacts have a body in common with another one, the pitch excepted; None: none has."""
     count = np.bincount(contacts.bodies.reshape(-1), minlength=pitch + 1)
+
+    # the pitch does not move: sharing it couples nothing
     count[pitch] = 0
     many = count > _SINGLE
     if not np.count_nonzero(many):
         return None
+
     first, second = many[contacts.bodies]
     return first | second
 
@@ -116,8 +126,11 @@ def _ranks(contacts: Contacts, shared: np.ndarray, num_fields: int) -> list[np.n
     """Return rows of the shared contacts: the first of every field, the second of every field, ..."""
     rows = np.flatnonzero(shared)
     field = contacts.bodies[0, rows] % num_fields
+
+    # stable: within a field the contacts keep their order
     order = np.argsort(field, kind="stable")
     rows, field = rows[order], field[order]
+
     rank = np.arange(len(rows)) - np.searchsorted(field, field)
     return [rows[rank == k] for k in range(int(rank.max()) + 1)]
 
@@ -133,22 +146,30 @@ class _Rows:
         self.velocity, self.spin = bodies.flat_velocity, bodies.spin
         pair, self.normal, self.gap = contacts
         self.first = pair[0]
+
         self.tangent = np.empty_like(self.normal)
         np.negative(self.normal[1], out=self.tangent[0])
         self.tangent[1] = self.normal[0]
+
         self.places = np.empty((2, *pair.shape), np.int64)  # of the velocities [2, 2, n]
         self.places[:, 0] = pair
         np.add(pair, bodies.num, out=self.places[:, 1])
+
         self.weight = bodies.flat_weight.take(self.places)
         _, rub_weight, self.lever, self.spin_gain = bodies.constants.take(self.first, 1)
         weight_i, weight_j = self.weight[:, 0]
+
         self.mass = _ONE / (weight_i + weight_j)
         self.rub_mass = _ONE / (rub_weight + weight_j)
+
+        # bounces go by the speed at which the pair meets, before any impulse
         leaving = _along(self.normal, _difference(self.velocity[self.places]))
         self.bounces = (leaving < -BOUNCE_SPEED) & (self.first < bodies.num_balls)
+
         self.leave_speed = np.maximum(self.gap, _ZERO) * (-1 / tick_s)
         if np.count_nonzero(self.bounces):
             np.copyto(self.leave_speed, -RESTITUTION * leaving, where=self.bounces)
+
         self.press = self.rub = self.pushed = np.zeros(len(self.gap))
 
     def part(self, rows: np.ndarray) -> _Rows:
@@ -156,6 +177,7 @@ class _Rows:
         part = object.__new__(_Rows)
         for name, value in vars(self).items():
             setattr(part, name, value if name in ("velocity", "spin") else value.take(rows, -1))
+
         return part
 
     def stop(self) -> np.ndarray:
@@ -163,15 +185,21 @@ class _Rows:
         pair = self.velocity[self.places]
         speed = _difference(pair)
         away, slip = speed * self.normal, _along(self.tangent, speed)
+
         pressed = np.maximum(self.press + (self.leave_speed - away[0] - away[1]) * self.mass, _ZERO)
+
+        # Coulomb friction: what rubs is limited by what presses
         spin = self.spin[self.first]
         limit = FRICTION * pressed
         rubbed = self.rub - (slip + spin * self.lever) * self.rub_mass
         np.minimum(np.maximum(rubbed, -limit, out=rubbed), limit, out=rubbed)
+
         press, rub = pressed - self.press, rubbed - self.rub
         self.press, self.rub = pressed, rubbed
+
         self._apply(self.velocity, pair, press * self.normal + rub * self.tangent)
         self.spin[self.first] = spin + rub * self.spin_gain
+
         return press
 
     def aim(self, share: float, most: float) -> None:

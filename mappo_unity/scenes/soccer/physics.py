@@ -57,23 +57,30 @@ class SoccerPhysics:
         bodies = (1 + num_agents, num_fields)
         self.pitch = Pitch(blue_closed)
         self.num_fields, self.num_agents = num_fields, num_agents
+
         self._bodies = Bodies(num_fields, num_agents * num_fields, (BALL_MASS, BALL_RADIUS), AGENT_MASS)
         self._last = bodies[0] * num_fields  # the pitch's number
+
         self.position = np.zeros((2, *bodies))
         self.velocity = self._bodies.velocity[:, : self._last].reshape(2, *bodies)
         self.spin = self._bodies.spin[:num_fields]
+
         # velocity changes of a tick by the bodies' numbers; kicks and drives are their parts
         self._change = np.zeros((2, self._last + 1))
         self.kick = self._change[:, :num_fields]
         self._drive = self._change[:, num_fields : self._last].reshape(2, num_agents, num_fields)
+
         self._kept = np.full((2, self._last + 1), AGENT_KEPT)
         self._kept[:, :num_fields] = BALL_KEPT
         self.touching = np.zeros((num_agents, num_fields), bool)
+
         radius = np.where(np.arange(bodies[0]) == 0, BALL_RADIUS, AGENT_RADIUS)
         self._radius = np.repeat(radius, num_fields)
         self._radii = np.tile(self._radius, (NUM_FEATURES, 1))
         self._no_goals = np.zeros(num_fields, np.int64)
+
         self._gaps: Gaps | None = None  # of `position`; None: bodies were placed or stopped since
+
         self._first, self._second = np.array(list(combinations(range(bodies[0]), 2))).T
         reach = radius[self._first] + radius[self._second] + MARGIN
         self._reach_squared = np.repeat((reach**2)[:, None], num_fields, axis=1)
@@ -83,6 +90,7 @@ class SoccerPhysics:
         self.position[0, body, fields] = x
         self.position[1, body, fields] = z
         self.velocity[:, body, fields] = 0
+
         self._gaps = None
         if body == 0:
             self.spin[fields] = 0
@@ -98,11 +106,15 @@ class SoccerPhysics:
         contacts, begun = self._contacts()
         points = self._kick_points(begun) if np.count_nonzero(begun) else None
         solved = None if contacts is None else self._bodies.solve(contacts, TICK_S)
+
         start = self.position
         self.position = start + self._moves(solved)
         self._stop_at_pitch(start)
+
+        # kicks come last: from where the agents are after the tick towards the contact before it
         if points is not None:
             self._kick(begun, points, kick_power)
+
         return begun, *self._goals(start)
 
     def get_state(self) -> dict[str, Any]:
@@ -118,9 +130,13 @@ class SoccerPhysics:
     def _accelerate(self, drive: np.ndarray) -> None:
         bodies = self._bodies
         self._drive[...] = drive
+
         bodies.velocity += self._change
         bodies.velocity *= self._kept
+
+        # a kick acts in one tick only
         self.kick[...] = _ZERO
+
         spin = self.spin
         spin *= _BALL_KEPT
         np.minimum(spin, _MAX_SPIN, out=spin)
@@ -133,18 +149,23 @@ class SoccerPhysics:
         squares = away * away
         squared = squares[0] + squares[1]
         close = squared < self._reach_squared
+
         touching = close[: self.num_agents]
         begun = touching > self.touching
         self.touching = touching
+
         parts = []
         if np.count_nonzero(close):
             parts.append(self._pairs(close, away, squared))
+
         at = self._flat(position)
         if self._gaps is None:
             self._gaps = self.pitch.gaps(at, self._radii)
+
         faced = self.pitch.contacts(at, self._gaps)
         if faced.disc.size:
             parts.append(self._with_pitch(faced))
+
         if len(parts) == 2:
             return Contacts(*(np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))), begun
         return (parts[0] if parts else None), begun
@@ -152,8 +173,10 @@ class SoccerPhysics:
     def _pairs(self, close: np.ndarray, away: np.ndarray, squared: np.ndarray) -> Contacts:
         """Return contacts of bodies with each other: the pairs and fields that are `close`."""
         pair, field = close.nonzero()
+
         distance = np.sqrt(squared[pair, field]) + 1e-12
         bodies = np.stack([self._first[pair], self._second[pair]]) * self.num_fields + field
+
         first, second = self._radius[bodies]
         return Contacts(bodies, away[:, pair, field] / distance, distance - first - second)
 
@@ -169,12 +192,15 @@ class SoccerPhysics:
         the engine's position iterations only.
         """
         moves = self._bodies.velocity * _TICK
+
         ball = moves[:, : self.num_fields]
         squares = ball * ball
         way = np.sqrt(squares[0] + squares[1]) + _TINY
         ball *= _ONE - np.minimum(_SLIP_SHARE, _SLIP_WAY / way)
+
         if solved is not None:
             solved.push_out(moves, PUSH_OUT, MAX_PUSH_OUT)
+
         return moves[:, : self._last].reshape(self.position.shape)
 
     def _stop_at_pitch(self, start: np.ndarray) -> None:
@@ -185,23 +211,30 @@ class SoccerPhysics:
         begin, end = self._flat(start), self._flat(self.position)
         before, self._gaps = self._gaps, self.pitch.gaps(end, self._radii)
         assert before is not None
+
         hits, share = self.pitch.way(begin, end, before, self._gaps, self._radius)
         if not hits.disc.size:
             return
+
         body, normal, gap = hits
         step = end[:, body] - begin[:, body]
         into = normal * step
         slides = gap - into[0] - into[1] < MARGIN
+
         end[:, body] += np.where(slides, -gap * normal, (share - 1) * step)
+
+        # bodies stand at the surface now: a contact without a gap, at which they bounce
         self._gaps = None
         self._bodies.solve(self._with_pitch(Faced(body, normal, np.zeros(len(body)))), TICK_S)
 
     def _kick_points(self, begun: np.ndarray) -> np.ndarray:
         """Return the points of contact [2, k] of agents that began one: midway between the surfaces."""
         agent, field = np.nonzero(begun)
+
         at = self.position[:, 1 + agent, field]
         away = self.position[:, 0, field] - at
         distance = np.sqrt((away * away).sum(axis=0)) + 1e-12
+
         return at + away / distance * (0.5 * (distance + AGENT_RADIUS - BALL_RADIUS))
 
     def _kick(self, begun: np.ndarray, points: np.ndarray, power: np.ndarray) -> None:
@@ -209,6 +242,8 @@ class SoccerPhysics:
         agent, field = np.nonzero(begun)
         away = points - self.position[:, 1 + agent, field]
         away *= KICK_SPEED * power[agent, field] / (np.sqrt((away * away).sum(axis=0)) + 1e-12)
+
+        # two agents may kick a ball in one tick: `add.at` counts both, an indexed sum only one
         for axis in range(2):
             np.add.at(self.kick[axis], field, away[axis])
 
@@ -217,6 +252,7 @@ class SoccerPhysics:
         ball = self.position[:, 0]
         if np.abs(ball[0]).max() < GOAL_NEAR_X:
             return self._no_goals, self._no_goals
+
         over = np.flatnonzero(np.abs(ball[0]) > GOAL_LINE_X)
         if over.size:
             begin = start[:, 0, over]
@@ -224,6 +260,7 @@ class SoccerPhysics:
             step = ball[:, over] - begin
             ball[:, over] = begin + step * np.clip(to_line / step[0], 0, 1)
             self._gaps = None
+
         return self.pitch.goals(ball[0], ball[1], BALL_RADIUS)
 
     def _flat(self, position: np.ndarray) -> np.ndarray:

@@ -72,8 +72,10 @@ class Pitch:
         ends = [
             (post, NET_Z, post, back, GOAL_FLOOR_Z, -1.0) for post, back in zip(POST_X, BACK_X, strict=True)
         ]
+
         if blue_closed:
             ends[0] = (BLOCK_X, BLOCK_Z, math.inf, BLOCK_X, BLOCK_Z, BLOCK_Z)
+
         self._ends = np.array(ends).T.copy()
 
     def gaps(self, at: np.ndarray, radius: np.ndarray) -> Gaps:
@@ -83,19 +85,24 @@ class Pitch:
         """
         folded = np.abs(at)
         x, z = folded
+
         ends = self._ends.take(at[0] > _ZERO, 1)
         along = folded - ends[:2]
         squares = along * along
+
         gap = np.empty((NUM_FEATURES, len(x)))
         np.subtract(_SIDE_GAP, z, out=gap[_SIDE])
         np.subtract(_CORNER_GAP, _COS * x + _SIN * z, out=gap[_CORNER])
         np.subtract(_NET_GAP, z, out=gap[_NET])
         np.sqrt(squares[0] + squares[1], out=gap[_EDGE])
         np.subtract(ends[3], x, out=gap[_BACK])
+
+        # a feature that the disc does not face, from where it is, is infinitely far
         in_net = x > ends[2]
         np.putmask(gap[_NET], ~in_net, _INF)
         np.putmask(gap[_EDGE], in_net | (z < ends[5]), _INF)
         np.putmask(gap[_BACK], z >= ends[4], _INF)
+
         gap -= radius
         return Gaps(gap, _SIN * x - _COS * z <= _CORNER_STOP)
 
@@ -115,20 +122,27 @@ class Pitch:
         """
         hit = after.gap < _DEEP
         hit[_CORNER] &= before.beside_corner | after.beside_corner
+
         step = end - start
         step *= step
         # a way that meets an edge is at least as long as the gaps before and after it
         hit[_EDGE] |= before.gap[_EDGE] + after.gap[_EDGE] < np.sqrt(step[0] + step[1])
+
         if not np.count_nonzero(hit):
             return _NOTHING, _NOTHING.gap
+
+        # faces and edges end ways by different formulas
         edge = np.flatnonzero(hit[_EDGE])
         hit[_EDGE] = False
         faced, share = _ends(self._faced(hit, end, after.gap), start, end)
+
         if edge.size:
             edges, until = self._edge_ways(edge, start, end, radius)
             faced, share = _joined(faced, edges), np.concatenate([share, until])
+
         order = np.lexsort((share, faced.disc))
         order = order[np.diff(faced.disc[order], prepend=-1) > 0]  # the first that ends a way
+
         return _part(faced, order), share[order]
 
     def goals(self, x: np.ndarray, z: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -139,13 +153,17 @@ class Pitch:
         """
         reach = radius + MARGIN
         floor_x = GOAL_FLOOR_X - math.sqrt(reach**2 - BALL_HEIGHT**2)
+
         purple = x > 0
         away_x, z = np.abs(x), np.abs(z)
+
         floor = (away_x > floor_x) & (z < GOAL_FLOOR_Z)
         away_x, away_z = away_x - POST_X[purple.astype(np.intp)], z - NET_Z
         post = away_x * away_x + away_z * away_z < reach**2
+
         parts = floor.astype(np.int64) + post
         blue = np.zeros_like(parts) if self.blue_closed else np.where(purple, 0, parts)
+
         return blue, np.where(purple, parts, 0)
 
     def _edge(self, x: np.ndarray) -> np.ndarray:
@@ -156,12 +174,16 @@ class Pitch:
         """Return features with their normals: those `faced` [5, n] by the discs `at` x, z [2, n]."""
         (places,) = faced.reshape(-1).nonzero()  # much faster than two-dimensional
         feature, disc = np.divmod(places, faced.shape[1])
+
         at = at.take(disc, 1)
         normal = _NORMAL.take(feature, 1)
+
         edge = (feature == _EDGE).nonzero()[0]
         if edge.size:
             at_edge = at[:, edge]
             normal[:, edge] = _unit(np.abs(at_edge) - self._edge(at_edge[0]))
+
+        # back from the folded corner to the quarter of the pitch that the disc is in
         normal *= np.copysign(_ONE, at)
         return Faced(disc, normal, gap.take(places))
 
@@ -173,14 +195,18 @@ class Pitch:
         |m + s d| = r with m from the edge to the start and d the way: s = (-b - sqrt(b^2 - a c)) / a.
         """
         start, end, radius = start[:, disc], end[:, disc], radius[disc]
+
         m, d = start - np.copysign(self._edge(end[0]), end), end - start
         a, b = _dot(d, d), _dot(m, d)
+
         inside = b * b - a * (_dot(m, m) - (radius - _ROUNDING) ** 2)
         hit = np.flatnonzero((b < 0) & (inside > 0) & (-b - np.sqrt(np.maximum(inside, 0)) < a))
         if not hit.size:
             return _NOTHING, _NOTHING.gap
+
         m, d = m[:, hit], d[:, hit]
         share = np.maximum((-b[hit] - np.sqrt(inside[hit])) / a[hit], 0.0)
+
         away = _unit(m + share * d)
         return Faced(disc[hit], away, _dot(away, m + d) - radius[hit]), share
 
@@ -193,11 +219,15 @@ def _ends(faces: Faced, start: np.ndarray, end: np.ndarray) -> tuple[Faced, np.n
     disc, normal, gap = faces
     start = start.take(disc, 1)
     step = end.take(disc, 1) - start
+
     advance = _dot(normal, step)  # negative: towards the face
     meets = advance < 0
     share = np.clip(1.0 - gap / np.where(meets, advance, -1.0), 0.0, 1.0)
+
+    # beyond its end, the corner wall's plane is not a wall
     x, z = np.abs(start + share * step)
     meets &= (normal[0] == 0) | (normal[1] == 0) | (_S * x - _C * z <= CORNER_END)
+
     return _part(faces, meets), share[meets]
 
 

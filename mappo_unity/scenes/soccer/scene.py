@@ -73,18 +73,24 @@ class SoccerScene(Scene):
         super().__init__(**options)
         fields, agents = self.num_areas, self.agents_per_area
         self.physics = SoccerPhysics(fields, agents, self.BLUE_CLOSED)
+
         self.yaw = np.zeros((agents, fields))  # rad, clockwise from z seen from above
         self.timer = np.zeros(fields, np.int64)  # ticks since the field's last reset
         self.touch_reward = np.zeros(self.num_slots, np.float32)  # read at the start of an episode
+
         teams = np.array([role.team for role in self.ROLES])
         self._team = np.tile(teams, fields)  # [S]
+
         self._motions = np.concatenate([_motions(role) for role in self.ROLES], axis=1)
         self._motion_offset = np.repeat(27 * np.arange(agents, dtype=np.int32)[:, None], fields, axis=1)
         self._slot = np.arange(self.num_slots).reshape(fields, agents).T.copy()  # [A, F]
+
         tick_reward = np.array([role.tick_reward for role in self.ROLES], np.float32)
         self._tick_reward = np.tile(tick_reward, fields) if tick_reward.any() else None
+
         self._kick_power = np.zeros((agents, fields))
         self._drive = np.zeros((2, agents, fields))
+
         agent_tags = [("blueAgent", "purpleAgent")[role.team] for role in self.ROLES]
         self._view = SoccerView(self.physics, self.yaw, self.VIEWS, agent_tags)
 
@@ -98,6 +104,7 @@ class SoccerScene(Scene):
         """Return what the agents' rays meet, one array a sensor."""
         rows = [slots[:0]] * len(self.BEHAVIORS)
         rows[behavior] = slots
+
         return self._view.frames(rows)[behavior]
 
     def observe_all(self, slots: list[np.ndarray]) -> list[list[np.ndarray]]:
@@ -108,16 +115,21 @@ class SoccerScene(Scene):
         """Turn the agents; keep their velocity changes and kicks for the physics; reward time."""
         code = self.agents.discrete.dot(_CODE).take(self._slot) + self._motion_offset
         ahead, right, turn, self._kick_power = self._motions.take(code, 1)
+
         sin, cos = np.sin(self.yaw), np.cos(self.yaw)
         np.add(ahead * sin, right * cos, out=self._drive[0])
         np.subtract(ahead * cos, right * sin, out=self._drive[1])
+
+        # after the drive: turns count from the next tick
         self.yaw += turn
+
         if self._tick_reward is not None:
             self.agents.reward += self._tick_reward
 
     def controllers(self) -> None:
         """Count the fields' time; interrupt episodes at its end, blue first."""
         self.timer += _TICK
+
         late = self.timer >= _LATE
         if np.count_nonzero(late):
             self._end(np.flatnonzero(late), (BLUE, PURPLE), interrupted=True)
@@ -125,8 +137,10 @@ class SoccerScene(Scene):
     def simulate(self) -> None:
         """Move the bodies; reward touches of the ball; score."""
         begun, blue, purple = self.physics.step(self._drive, self._kick_power)
+
         if np.count_nonzero(self.touch_reward):
             self.agents.reward += begun.T.ravel() * self.touch_reward
+
         conceded = blue + purple
         if np.count_nonzero(conceded):
             for again in range(int(conceded.max())):
@@ -150,25 +164,30 @@ class SoccerScene(Scene):
         """
         slots = self._slots(fields)
         field = slots // self.agents_per_area
+
         gain = 1 - self.timer[field] / EPISODE_TICKS
         self.add_group_reward(slots, np.where(self._team[slots] == scorer[field], gain, -1))
+
         self._end(fields, (PURPLE, BLUE))
 
     def _end(self, fields: np.ndarray, teams: tuple[int, int], interrupted: bool = False) -> None:
         slots = self._slots(fields)
         for team in teams:
             self.end_episode(slots[self._team[slots] == team], interrupted)
+
         self._reset_fields(fields)
 
     def _reset_fields(self, fields: np.ndarray) -> None:
         """Place ball and agents anew, at rest; draws for agents by their number, then for the ball."""
         num = len(fields)
         self.timer[fields] = 0
+
         for agent, role in enumerate(self.ROLES):
             x = role.x + self.rng.uniform(-SPREAD_X, SPREAD_X, num)
             self.physics.place(1 + agent, fields, x, role.z)
             yaw = np.radians(self.rng.uniform(80, 100, num))
             self.yaw[agent, fields] = yaw if role.team == BLUE else -yaw
+
         x, z = self.rng.uniform(-BALL_SPREAD, BALL_SPREAD, (2, num))
         self.physics.place(0, fields, x, z)
 
@@ -225,5 +244,6 @@ def _motions(role: Role) -> np.ndarray:
     ahead = np.array([0, role.forward, -role.forward])[forward] * RUN_SPEED
     right = np.array([0, role.side, -role.side])[side] * RUN_SPEED
     ahead[side > 0] = 0  # a side action replaces the forward direction, but not the kick
+
     kick = np.ones(27) if role.always_kicks else (forward == 1).astype(float)
     return np.stack([ahead, right, np.array([0, -TURN_RAD, TURN_RAD])[turn], kick])

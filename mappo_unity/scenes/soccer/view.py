@@ -73,19 +73,24 @@ class SoccerView:
         """`yaw`: the scene's array float64 [A, F]; `views`: one a behavior; `agent_tags`: one an agent."""
         self._physics, self._yaw = physics, yaw
         self._views = [_Rays(view) for view in views]
+
         walls = list(_walls(physics.pitch.blue_closed))
         self._walls = Walls(
             np.array([wall.begin for wall in walls]), np.array([wall.end for wall in walls]), CAST_RADIUS
         )
+
         owned = [(edge, number) for number, wall in enumerate(walls) for edge in wall.edges]
         self._edges = np.array([edge for edge, _ in owned]).T[:, :, None]  # [2, C, 1]
         self._owner = np.array([n for _, n in owned])
+
         radius = np.array([BALL_RADIUS] + [AGENT_RADIUS] * len(agent_tags))
         self._num_bodies, self._num_discs = len(radius), len(radius) + len(owned)
         self._reach = np.full((self._num_discs, 1), CAST_RADIUS)  # bodies, edges
         self._reach[: len(radius), 0] = np.sqrt((radius + CAST_RADIUS) ** 2 - CAST_HEIGHT**2)
+
         tags = ["ball", *agent_tags, *(walls[owner].tag for _, owner in owned), *(wall.tag for wall in walls)]
         self._columns = np.array([rays.columns(tags) for rays in self._views])
+
         self._layouts: dict[tuple[int, ...], _Layout] = {}
 
     def frames(self, slots: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
@@ -95,13 +100,19 @@ class SoccerView:
         """
         layout = self._layout(tuple(map(len, slots)))
         field, agent = np.divmod(np.concatenate(slots), len(self._yaw))
+
         heading = self._yaw[agent, field].take(layout.caster) + layout.angles
         travel = self._cast(agent, field, heading, layout.caster)
+
         nearest = first_met(travel, layout.number)
+
+        # one of a ray's numbers says what it meets, the last one how far away
         numbers = np.zeros(layout.size, np.float32)
         numbers[layout.first + self._columns.take(layout.columns + nearest)] = 1.0
+
         share = travel.take(nearest * len(heading) + layout.every) / RAY_LENGTH
         numbers[layout.last] = np.minimum(share, 1.0)
+
         return [
             [numbers[begin:end].reshape(shape)[:, columns] for columns in sensors]
             for begin, end, shape, sensors in layout.blocks
@@ -118,20 +129,26 @@ class SoccerView:
         bodies, discs = self._num_bodies, self._num_discs
         position = self._physics.position
         origin = position[:, 1 + agent, field]
+
         towards = np.empty((3, discs, len(agent)))  # x, z, and what is beyond the reach
         np.subtract(position.take(field, 2), origin[:, None], out=towards[:2, :bodies])
         np.subtract(self._edges, origin[:, None], out=towards[:2, bodies:])
         towards[2] = unmet_discs(towards[:2], self._reach)
+
         places = self._walls.places(origin)
         touched = self._walls.touched(places, TOUCH)
         np.putmask(places[0], touched | (places[0] < 0), np.nan)
         np.putmask(towards[2, bodies:], touched.take(self._owner, 0), np.inf)
+
+        # up to here all is a caster's; from here on, a ray's
         towards, places = towards.take(caster, 2), places.take(caster, 2)
+
         direction = np.stack([np.sin(heading), np.cos(heading)])
         travel = np.empty((discs + places.shape[1] + 1, len(heading)))
         travel[:discs] = cast_discs(towards[:2], towards[2], direction)
         travel[discs:-1] = self._walls.cast(places, direction)
         travel[-1] = _BEYOND
+
         return travel
 
     def _layout(self, counts: tuple[int, ...]) -> _Layout:
@@ -148,6 +165,7 @@ class _Rays:
         self.tags = view.tags
         self.angles = np.concatenate([eyes.angles for eyes in sensors])
         self.numbers = len(view.tags) + 2
+
         ends = np.cumsum([eyes.size for eyes in sensors]).tolist()
         self.size = ends[-1]
         self.sensors = [slice(end - eyes.size, end) for end, eyes in zip(ends, sensors, strict=True)]
@@ -173,19 +191,24 @@ class _Layout:
     def __init__(self, counts: Sequence[int], views: Sequence[_Rays], num_columns: int) -> None:
         rays = [len(view.angles) for view in views]
         behavior = np.repeat(np.arange(len(views)), np.multiply(counts, rays))
+
         numbers = np.array([view.numbers for view in views])[behavior]
         self.caster = np.repeat(np.arange(sum(counts)), np.repeat(rays, counts))
         self.angles = np.concatenate(
             [np.tile(view.angles, count) for view, count in zip(views, counts, strict=True)]
         )
+
         self.columns = behavior * num_columns
         self.every = np.arange(len(behavior))
         self.number = numbered(num_columns, len(behavior))
+
         self.size = int(numbers.sum())
         self.last = np.cumsum(numbers) - 1
         self.first = self.last - (numbers - 1)
+
         shapes = [(count, view.size) for count, view in zip(counts, views, strict=True)]
         ends = np.cumsum([count * size for count, size in shapes])
+
         self.blocks = [
             (end - shape[0] * shape[1], end, shape, view.sensors)
             for end, shape, view in zip(ends.tolist(), shapes, views, strict=True)
@@ -206,16 +229,19 @@ def _walls(blue_closed: bool) -> Iterator[_Wall]:
     """Yield the colliders of the pitch that level casts can meet."""
     (c, s), length = CORNER_NORMAL, CORNER_LENGTH
     edge = (c * CORNER_OFFSET + s * CORNER_END, s * CORNER_OFFSET - c * CORNER_END)  # (15.46, 4.216)
+
     for z in (-1.0, 1.0):
         yield _faced("wall", (-15.5, z * SIDE_Z), (15.5, z * SIDE_Z))
         for x in (-1.0, 1.0):
             free = (x * edge[0], z * edge[1])
             yield _faced("wall", (x * (edge[0] - s * length), z * (edge[1] + c * length)), free, free)
+
     for x, goal, post_x, back_x in zip((-1.0, 1.0), ("blueGoal", "purpleGoal"), POST_X, BACK_X, strict=True):
         if x < 0 and blue_closed:
             corners = ((-BLOCK_X, -BLOCK_Z), (-BLOCK_X, BLOCK_Z))
             yield _faced("wall", *corners, *corners)
             continue
+
         yield _faced(goal, (x * back_x, -GOAL_FLOOR_Z), (x * back_x, GOAL_FLOOR_Z))
         for z in (-NET_Z, NET_Z):
             yield _faced(goal, (x * post_x, z), (x * (post_x + NET_LENGTH), z), (x * post_x, z))

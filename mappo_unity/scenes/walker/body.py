@@ -109,10 +109,12 @@ def joint_axes(name: str) -> list[tuple[str, tuple[int, int, int], float, float]
     """
     joint = JOINTS[name]
     free = [("X", joint.axes[0], *joint.x)]
+
     if joint.z:
         free.insert(0, ("Z", joint.axes[2], -joint.z, joint.z))
     if joint.y:
         free.append(("Y", joint.axes[1], -joint.y, joint.y))
+
     return free
 
 
@@ -143,14 +145,17 @@ def area(kinematic: bool = False) -> mujoco.MjSpec:
     """
     spec = mujoco.MjSpec.from_string(_OPTIONS)
     bodies = {"": spec.worldbody}
+
     for part in depth_first():
         bodies[part.name] = _add_part(bodies[part.parent], part)
+
     if kinematic:
         for flag in ("CONTACT", "CONSTRAINT", "GRAVITY", "SPRING", "DAMPER"):
             spec.option.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
         _add_sensors(spec)
     else:
         _add_surroundings(spec)
+
     return spec
 
 
@@ -171,6 +176,7 @@ def _add_part(parent: mujoco.MjsBody, part: Part) -> mujoco.MjsBody:
     body = parent.add_body(name=part.name, pos=part.offset)
     if not part.parent:
         body.add_freejoint(name=part.name)
+
     for letter, axis, low, high in joint_axes(part.name) if part.name in JOINTS else ():
         share = JOINTS[part.name].share
         body.add_joint(
@@ -183,6 +189,7 @@ def _add_part(parent: mujoco.MjsBody, part: Part) -> mujoco.MjsBody:
             solref_limit=_SOLREF,
             solimp_limit=_SOLIMP,
         )
+
     body.add_geom(name=part.name, mass=part.mass, **_SURFACE, **_shape(*part.collider))
     return body
 
@@ -195,6 +202,7 @@ def _shape(kind: str, radius: float, height: float) -> dict:
         return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": FOOT_HALF, "pos": FOOT_CENTRE}
     if kind == "sphere":
         return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0, 0]}
+
     along = np.array([kind == "x", kind == "y", 0]) * (height / 2 - radius)
     return {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [radius, 0, 0], "fromto": [*-along, *along]}
 
@@ -203,12 +211,15 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
     world, box = spec.worldbody, mujoco.mjtGeom.mjGEOM_BOX
     plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [13, 13, 1], "quat": [0.5**0.5, -(0.5**0.5), 0, 0]}
     world.add_geom(name="ground", pos=[0, GROUND_Y, 0], **plane, **_SURFACE)
+
     for side in (-12.5, 12.5):
         world.add_geom(type=box, pos=[side, 0.5, 0], size=[0.125, 0.625, 12.625], **_SURFACE)
         world.add_geom(type=box, pos=[0, 0.5, side], size=[12.625, 0.625, 0.125], **_SURFACE)
+
     target = world.add_body(name="target", pos=[0, 1, 1])
     target.add_freejoint(name="target")
     target.add_geom(name="target", type=box, size=[TARGET_HALF] * 3, mass=1, gap=CONTACT_GAP, **_SURFACE)
+
     spec.add_sensor(
         name="touched",
         type=mujoco.mjtSensor.mjSENS_CONTACT,

@@ -39,6 +39,7 @@ def shapes(scene: Walker, area: int) -> list[Shape]:
     """Return the platform with lines 2.5 m apart, the parts of the figure and the target."""
     drawn = _platform()
     position, rotation = scene.physics.position[area], scene.physics.rotation[area]
+
     for number, part in enumerate(body.PARTS):
         turn = quaternion_rotation(rotation[number])
         place = position[number] + turn @ _CENTRE[number]
@@ -51,6 +52,7 @@ def shapes(scene: Walker, area: int) -> list[Shape]:
                 drawn.append(
                     ball(place + turn @ np.array([0.08 * side, 0.05, 0.23]), 0.03, DARK, shadow=False)
                 )
+
     target = scene.physics.target_position[area]
     drawn.append(box(target, (body.TARGET_HALF,) * 3, YELLOW))
     return [*drawn, cylinder(target + [0, 1.0, 0], 0.03, 1.0, faded(YELLOW, 0.6))]
@@ -64,6 +66,7 @@ def followed(scene: Walker, area: int) -> np.ndarray:
 def _part(number: int, part: body.Part, place: np.ndarray, turn: np.ndarray) -> Shape:
     kind, radius = part.collider[0], float(_RADIUS[number])
     color = ORANGE if part.name[-1] in "LR" and part.name[:4] in ("hand", "foot") else BLUE
+
     if kind == "foot":
         return box(place, _HALF[number], color, turn)
     if kind == "sphere":

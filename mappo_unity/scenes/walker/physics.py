@@ -28,6 +28,7 @@ def colliders() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     names = [part.name for part in body.PARTS]
     half, centre, rest = (np.zeros((len(names), 3)) for _ in range(3))
     radius = np.zeros(len(names))
+
     for part in body.depth_first():
         number, (kind, radius_m, height) = names.index(part.name), part.collider
         radius[number] = radius_m
@@ -35,8 +36,10 @@ def colliders() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
             half[number], centre[number] = body.FOOT_HALF, body.FOOT_CENTRE
         elif kind != "sphere":
             half[number, "xy".index(kind)] = height / 2 - radius_m
+
         if part.parent:
             rest[number] = rest[names.index(part.parent)] + part.offset
+
     return half, radius, centre, rest
 
 
@@ -64,15 +67,18 @@ class WalkerPhysics:
         self._areas = AreaPhysics(body.area(), num_areas, num_threads=num_threads)
         self._figures = AreaPhysics(body.area(kinematic=True), num_areas, num_threads=num_threads)
         self._armatures = [self._areas.own_model(area)[0].dof_armature[6:32] for area in range(num_areas)]
+
         parts = len(body.PARTS)
         by_kind = np.split(self._figures.sensordata, np.cumsum([3 * parts, 4 * parts, 3 * parts]), axis=1)
         self.position, self.rotation, self.velocity, self.spin = (
             kind.reshape(num_areas, parts, -1) for kind in by_kind
         )
+
         self.angle = self._areas.qpos[:, 7:33]
         self.target_position = self._areas.qpos[:, 33:36]
         self.drive_target = np.zeros((num_areas, len(body.HINGES)))
         self.drive_on = np.ones((num_areas, len(body.HINGES)))
+
         self.find_poses()
 
     def step(self) -> None:
@@ -80,8 +86,10 @@ class WalkerPhysics:
         self._areas.qvel[:, :32] *= DRAG_KEPT
         np.clip(self._areas.qvel[:, 3:32], -PART_MAX_SPIN, PART_MAX_SPIN, out=self._areas.qvel[:, 3:32])
         self._areas.qvel[:, 35:38] *= DRAG_KEPT
+
         spin = self._areas.qvel[:, 35:38]
         spin *= np.minimum(1, TARGET_MAX_SPIN / np.maximum(np.linalg.norm(spin, axis=1), 1e-9))[:, None]
+
         self._drive()
         self._areas.step()
         self.find_poses()
@@ -90,14 +98,18 @@ class WalkerPhysics:
         """Put figures into the start pose, turned by `yaw` [n] rad about +y, at rest; drives stay."""
         half = 0.5 * yaw
         turn = np.stack([np.cos(half), np.zeros_like(yaw), np.sin(half), np.zeros_like(yaw)], axis=1)
+
         self._areas.qpos[areas, :3] = body.HIPS_START
         self._areas.qpos[areas, 3:7] = turn
         self._areas.qpos[areas, 7:33] = 0
         self._areas.qvel[areas, :32] = 0
+
+        # the parts' poses by hand: the first observation comes before the next step finds them
         s, c = np.sin(yaw)[:, None], np.cos(yaw)[:, None]
         x, y, z = _REST.T
         self.position[areas] = np.stack([x * c + z * s, y + 0 * c, z * c - x * s], axis=2) + body.HIPS_START
         self.rotation[areas] = turn[:, None]
+
         self.velocity[areas] = 0
         self.spin[areas] = 0
 
@@ -105,6 +117,7 @@ class WalkerPhysics:
         """Return the distance between every part's collider and the ground, float64 [N, B] m."""
         w, x, y, z = np.moveaxis(self.rotation, 2, 0)
         up = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=2)
+
         centre = self.position[:, :, 1] + (up * _CENTRE).sum(axis=2)
         return centre - (np.abs(up) * _HALF).sum(axis=2) - _RADIUS - body.GROUND_Y
 
@@ -148,12 +161,17 @@ class WalkerPhysics:
         """
         error = self.drive_target - self.angle
         twist = np.cos(self.angle[:, _TWIST])
+
         stiffness = _STIFFNESS * self.drive_on
         damping = _DAMPING * np.maximum(self.drive_on, UNDRIVEN)
+
         error[:, _SWING] = np.sin(error[:, _SWING])
         stiffness[:, _SWING] *= twist * np.cos(self.drive_target[:, _TWIST])
         damping[:, _SWING] *= twist * twist
+
         self._areas.qfrc_applied[:, 6:32] = stiffness * error - damping * self._areas.qvel[:, 6:32]
+
+        # h D, the armature, of every area's own model
         damping *= body.TICK_S
         for armature, row in zip(self._armatures, damping, strict=True):
             armature[...] = row

@@ -74,9 +74,11 @@ class Walker(Scene):
         super().__init__(**options)
         self.physics = WalkerPhysics(self.num_areas, self.num_threads)
         self.physics.set_gravity(self.parameters["gravity"])
+
         self.goal_speed = np.full(self.num_areas, MAX_SPEED)
         self.cube_position = self.physics.position[:, 0].copy()
         self.cube_forward = np.tile([0.0, 0.0, 1.0], (self.num_areas, 1))
+
         self.strength = np.zeros((self.num_areas, len(body.JOINTS)))  # share of the largest force limit
         self.grounded = np.zeros((self.num_areas, len(body.PARTS)), bool)  # the contact flags
         self.touching = np.zeros_like(self.grounded)  # what touches the ground, whatever the flags say
@@ -84,9 +86,11 @@ class Walker(Scene):
     def fixed_update(self) -> None:
         """Aim the cubes, then reward matching the goal's velocity times looking at the target."""
         self._aim(np.arange(self.num_areas))
+
         goal = self.goal_speed[:, None] * self.cube_forward
         miss = np.linalg.norm(goal - self.physics.velocity.mean(axis=1), axis=1)
         match = (1 - np.minimum(miss / self.goal_speed, 1) ** 2) ** 2
+
         look = (np.einsum("ni,ni->n", self.cube_forward, forward(self.physics.rotation[:, _HEAD])) + 1) / 2
         self.agents.reward += match * look
 
@@ -94,6 +98,7 @@ class Walker(Scene):
         """Stand up, turned at random, with a new goal speed; the target and the drives stay."""
         if not self.started:
             self._place_targets(slots)
+
         self.physics.stand(slots, np.radians(self.rng.uniform(0, 360, len(slots))))
         self.grounded[slots] = False
         self._aim(slots)
@@ -104,14 +109,19 @@ class Walker(Scene):
         obs = np.empty((len(slots), 243), np.float32)
         ahead, rotation = self.cube_forward[slots], self.physics.rotation[slots]
         velocity, goal_speed = self.physics.velocity[slots], self.goal_speed[slots]
+
         mean = velocity.mean(axis=1)
         obs[:, 0] = np.linalg.norm(goal_speed[:, None] * ahead - mean, axis=1)
         obs[:, 1:4] = in_frame(ahead, mean)
+
+        # in the cube's frame the goal's velocity is straight ahead
         obs[:, 4:6] = 0
         obs[:, 6] = goal_speed
         obs[:, 7:11] = shortest_rotation(forward(rotation[:, 0]), ahead)
         obs[:, 11:15] = shortest_rotation(forward(rotation[:, _HEAD]), ahead)
         obs[:, 15:18] = in_frame(ahead, self.physics.target_position[slots] - self.cube_position[slots])
+
+        # a row of 15 numbers for each part; `_COLUMNS` leaves out those of joints that are not there
         parts = np.zeros((len(slots), len(_NAMES), _NUM_COLUMNS), np.float32)
         position = self.physics.position[slots]
         parts[:, :, 0] = self.grounded[slots]
@@ -121,8 +131,10 @@ class Walker(Scene):
             (7, position - position[:, :1]),
         ):
             parts[:, :, column : column + 3] = in_frame(ahead[:, None], vectors)
+
         parts[:, _JOINTED, 10:14] = relative_rotation(rotation[:, _PARENTS], rotation[:, _JOINTED])
         parts[:, _JOINTED, 14] = self.strength[slots]
+
         obs[:, 18:] = parts.reshape(len(slots), -1)[:, _COLUMNS]
         return [obs]
 
@@ -131,6 +143,7 @@ class Walker(Scene):
         action = self.agents.continuous[slots].astype(np.float64)
         share = np.clip((action[:, _TARGET_ACTION] + 1) / 2, 0, 1)
         self.physics.drive_target[slots] = _LOW + share * (_HIGH - _LOW)
+
         self.strength[slots] = (action[:, 26:] + 1) / 2
         self.physics.drive_on[slots] = self.strength[slots][:, _STRENGTH_OF_HINGE] > 0
 
@@ -138,10 +151,13 @@ class Walker(Scene):
         """Advance one tick; move targets that were touched; end episodes of those who fell."""
         self.physics.step()
         self._place_targets(np.flatnonzero(self.physics.target_touched() | self._targets_lost()))
+
+        # a contact that outlasts a reset, which clears its flag, sets none until it begins anew
         touching = self.physics.ground_gap() <= body.CONTACT_GAP
         begun = touching & ~self.touching
         self.grounded = (self.grounded | begun) & touching
         self.touching = touching
+
         fallen = (begun & _ENDS).sum(axis=1)
         for hits in (1, 2):  # the second hit of a tick sets -1 again, which the next record brings
             again = np.flatnonzero(fallen >= hits)
@@ -210,6 +226,7 @@ def shortest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     turn = np.empty((len(start), 4))
     turn[:, :3] = np.cross(start, end)
     turn[:, 3] = 1 + np.einsum("ni,ni->n", start, end)
+
     turn[turn[:, 3] < 1e-6] = (0, 1, 0, 0)
     return turn / np.linalg.norm(turn, axis=1, keepdims=True)
 
@@ -218,6 +235,7 @@ def relative_rotation(parent: np.ndarray, child: np.ndarray) -> np.ndarray:
     """Return quaternions [..., 4] (x, y, z, w >= 0) of `child` in `parent`, both [..., 4] (w first)."""
     pw, px, py, pz = np.moveaxis(parent, -1, 0)
     cw, cx, cy, cz = np.moveaxis(child, -1, 0)
+
     local = np.stack(
         [
             pw * cx - px * cw - py * cz + pz * cy,
@@ -227,4 +245,6 @@ def relative_rotation(parent: np.ndarray, child: np.ndarray) -> np.ndarray:
         ],
         axis=-1,
     )
+
+    # a rotation has two quaternions: the one with w >= 0
     return np.where(local[..., 3:] < 0, -local, local)

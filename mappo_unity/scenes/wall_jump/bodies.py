@@ -66,16 +66,20 @@ class WallJumpBodies:
         acts downward, m/s^2.
         """
         velocity, position = self.velocity, self.position
+
         velocity += drive
         velocity[:, 1] -= acceleration * TICK_S
         velocity *= AGENT_DRAG_KEPT
         self.block_velocity *= BLOCK_DRAG_KEPT
+
         floor_gap = position[:, 1] - (FLOOR_Y + AGENT_HALF[1])
         self._land(slice(None), floor_gap)
         shift, block_shift = self._contacts(floor_gap)
+
         position += velocity * TICK_S
         position[:, 1] += push_out(floor_gap)
         self.block += self.block_velocity * TICK_S
+
         if shift is not None:
             position += shift
             self.block += block_shift
@@ -84,12 +88,17 @@ class WallJumpBodies:
         """Return the small ground check, bool [n]: a surface up to 0.55 m below the feet's middle."""
         x, y, z = self.position[slots].T
         top = y - 0.05  # start of a ray of 1 m straight down; a body around its start is not hit
+
+        # the highest surface below the start counts
         level = np.where(_over_floor(x, z) & (top >= FLOOR_Y), FLOOR_Y, -np.inf)
+
         above_block = self._over_block(x, z, slots) & (top >= BLOCK_Y + BLOCK_HALF[1])
         level = np.where(above_block, BLOCK_Y + BLOCK_HALF[1], level)
+
         wall_top = self.wall_height[slots] / 2
         on_wall = (np.abs(x) < WALL_HALF_X) & (np.abs(z - WALL_Z) < WALL_HALF_Z) & (top >= wall_top)
         level = np.where(on_wall, np.maximum(level, wall_top), level)
+
         return top - level <= 1.0
 
     def grounded(self) -> np.ndarray:
@@ -127,6 +136,7 @@ class WallJumpBodies:
         """Stop falls at the floor, with the friction of that impulse."""
         velocity = self.velocity[rows]
         impulse = np.maximum(-np.maximum(gap, 0.0) / TICK_S - velocity[:, 1], 0.0) * (gap < CONTACT_GAP)
+
         velocity[:, 1] += impulse
         slide(velocity, impulse)
         self.velocity[rows] = velocity
@@ -135,30 +145,40 @@ class WallJumpBodies:
         """Solve agent-wall, agent-block and block-wall contacts; return push-outs of agents and blocks."""
         rows, num_wall, offset, half = self._near()
         stuck, stuck_gap, stuck_normal = self._blocks_at_wall()
+
         if not (rows.size or stuck.size):
             return None, floor_gap
+
         gap, normal = box_gap(offset, self.yaw[rows], AGENT_HALF, half)
         touch = (gap < CONTACT_GAP).nonzero()[0]
         wall, block = touch[touch < num_wall], touch[touch >= num_wall]
+
         self._stop(self.velocity, rows[wall], gap[wall], normal[wall])
         self._stop(self.block_velocity, stuck, stuck_gap, stuck_normal)
+
         shift, block_shift = np.zeros_like(self.position), np.zeros_like(self.position)
         shift[rows[wall]] += push_out(gap[wall])[:, None] * normal[wall]
         block_shift[stuck] += push_out(stuck_gap)[:, None] * stuck_normal
+
         if block.size:
             agents, way, held = rows[block], normal[block], stuck_gap < HELD_GAP
             mobility = self._block_mobility(agents, way, stuck[held], stuck_normal[held])
             between = wall[np.isin(rows[wall], agents)] if wall.size else wall
+
+            # a stop at one contact may undo another: agent and block, agent and wall, floor by turns
             for _ in range(SOLVER_ROUNDS):
                 velocity, block_velocity = self.velocity[agents], self.block_velocity[agents]
                 stop_pair(velocity, block_velocity, way, gap[block], AGENT_INVERSE_MASS, mobility)
                 self.velocity[agents], self.block_velocity[agents] = velocity, block_velocity
                 self._stop(self.velocity, rows[between], gap[between], normal[between])
                 self._land(agents, floor_gap[agents])
+
+            # the overlap goes to both in proportion to how easily they move
             share = (way**2 * (AGENT_INVERSE_MASS + mobility)).sum(axis=1)
             push = (push_out(gap[block]) / share)[:, None] * way
             shift[agents] += push * AGENT_INVERSE_MASS
             block_shift[agents] -= push * mobility
+
         return shift, block_shift
 
     def _block_mobility(
@@ -167,11 +187,13 @@ class WallJumpBodies:
         """Return blocks' inverse masses [n, 3], with 0 where an agent pushes its block into the wall."""
         mobility = np.empty((agents.size, 3))
         mobility[:] = BLOCK_INVERSE_MASS
+
         if held.size:
             normal = np.zeros_like(self.block)
             normal[held] = wall_normal
             into = np.einsum("ni,ni->n", normal[agents], way) > 0
             mobility[into] *= 1.0 - np.abs(normal[agents[into]])
+
         return mobility
 
     def _near(self, among: np.ndarray | None = None) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
@@ -183,17 +205,22 @@ class WallJumpBodies:
         position, wall_top = self.position, self.wall_height / 2
         wall = (np.abs(position[:, 2] - WALL_Z) < WALL_HALF_Z + _REACH) & (wall_top > FLOOR_Y)
         wall &= position[:, 1] < wall_top + _REACH
+
         offset = position - self.block
         block = (np.abs(offset) < _BLOCK_REACH).all(axis=1)
+
         if among is not None:
             wall, block = wall & among, block & among
+
         walls, blocks = wall.nonzero()[0], block.nonzero()[0]
         rows = np.concatenate([walls, blocks])
         offset = np.concatenate([position[walls] - _WALL_CENTRE, offset[blocks]])
+
         half = np.empty((rows.size, 3))
         half[walls.size :] = BLOCK_HALF
         half[: walls.size] = WALL_HALF_X, 0.0, WALL_HALF_Z
         half[: walls.size, 1] = wall_top[walls]
+
         return rows, walls.size, offset, half
 
     def _blocks_at_wall(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -201,12 +228,16 @@ class WallJumpBodies:
         offset = self.block - _WALL_CENTRE
         reach = (WALL_HALF_X + BLOCK_HALF[0], WALL_HALF_Z + BLOCK_HALF[2])
         gap_x, gap_z = np.abs(offset[:, 0]) - reach[0], np.abs(offset[:, 2]) - reach[1]
+
         gap = np.maximum(gap_x, gap_z)
         rows = np.flatnonzero((gap < CONTACT_GAP) & (self.wall_height / 2 > BLOCK_Y - BLOCK_HALF[1]))
+
+        # off an end or a face of the wall, whichever has the larger gap
         normal = np.zeros((rows.size, 3))
         side = gap_x[rows] > gap_z[rows]
         normal[:, 0] = np.where(side, np.sign(offset[rows, 0]), 0.0)
         normal[:, 2] = np.where(side, 0.0, np.sign(offset[rows, 2]))
+
         return rows, gap[rows], normal
 
     def _over_block(self, x: np.ndarray, z: np.ndarray, slots: np.ndarray | slice) -> np.ndarray:

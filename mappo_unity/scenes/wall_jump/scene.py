@@ -66,9 +66,11 @@ class WallJump(Scene):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.bodies = WallJumpBodies(self.num_areas)
+
         self.jump_left_s = np.zeros(self.num_areas, np.float32)
         self.jump_start_y = np.zeros(self.num_areas)
         self.configuration = np.full(self.num_areas, NOTHING_PENDING)
+
         self.drive = np.zeros((self.num_areas, 3))
         self.acceleration = np.zeros(self.num_areas)
         self._frames: list[np.ndarray] | None = (
@@ -83,13 +85,16 @@ class WallJump(Scene):
         """
         if not self.started:
             self.configuration[:] = self.rng.integers(0, CONFIGURATIONS, self.num_areas)
+
         slots = (self.configuration != NOTHING_PENDING).nonzero()[0]
         if not slots.size:
             return
+
         drawn = self.configuration[slots]
         heights = np.array([self.parameters[name] for name in HEIGHT_OF])
         self.bodies.wall_height[slots] = heights[drawn]
         self.configuration[slots] = NOTHING_PENDING
+
         behavior = BEHAVIOR_OF[drawn]
         moves = (self.agents.behavior[slots] != behavior) | (not self.started)
         if moves.any():
@@ -98,9 +103,11 @@ class WallJump(Scene):
     def begin_episode(self, slots: np.ndarray) -> None:
         """Place block and agent, draw a configuration; heading and a running jump stay."""
         self._place_blocks(slots)
+
         self.bodies.position[slots, 0] = 18 * (self.rng.random(len(slots)) - 0.5)
         self.bodies.position[slots, 1:] = 1.0, -12.0
         self.bodies.velocity[slots] = 0
+
         self.configuration[slots] = self.rng.integers(0, CONFIGURATIONS, len(slots))
 
     def decides(self) -> bool | np.ndarray:
@@ -121,25 +128,34 @@ class WallJump(Scene):
         self._frames = None
         self.agents.reward += TICK_REWARD
         grounded = bodies.grounded()
+
         sideways = SIDE[action[2]]
         ahead = FORWARD[action[0]] * (sideways == 0)  # a step to the side replaces it
+
         speed, sin, cos = np.where(grounded, 1.0, IN_AIR), np.sin(bodies.yaw), np.cos(bodies.yaw)
         direction = np.zeros((self.num_slots, 3))
         direction[:, 0] = speed * (ahead * sin + sideways * cos)
         direction[:, 2] = speed * (ahead * cos - sideways * sin)
+
+        # a running jump is not begun again, and a jump needs ground below the feet's middle
         starts = (action[3] == 1) & (self.jump_left_s <= 0)
         if starts.any():
             starts &= bodies.stands_over()
             self.jump_left_s[starts] = JUMP_S
             self.jump_start_y[starts] = bodies.position[starts, 1]
+
+        # after the direction: a turn counts from the next tick
         bodies.yaw += TURN[action[1]]
         self.drive = RUN_SPEED * direction
+
         jumps = self.jump_left_s > 0
         if jumps.any():
             self._steer_jumps(jumps.nonzero()[0], direction)
+
         falling = ~jumps & ~grounded
         self.acceleration = self.parameters["gravity"] + FALLING * falling
         self.jump_left_s -= np.float32(TICK_S)
+
         fallen = bodies.fallen()
         if fallen.any():
             self.set_reward(fallen, -1.0)
@@ -149,6 +165,7 @@ class WallJump(Scene):
     def simulate(self) -> None:
         """Move the bodies by one tick; an agent in the goal and over ground ends with +1."""
         self.bodies.step(self.drive, self.acceleration)
+
         inside = self.bodies.in_goal()
         if inside.size:
             inside = inside[self.bodies.stands_over(inside)]
@@ -178,9 +195,11 @@ class WallJump(Scene):
         upward, level = observe_rays(
             bodies.position[slots], bodies.yaw[slots], bodies.block[slots], bodies.wall_height[slots]
         )
+
         vector = np.empty((len(slots), 4), np.float32)
         vector[:, :3] = (bodies.position[slots] - GROUND_CENTRE) / OBS_SCALE
         vector[:, 3] = bodies.stands_over(slots)
+
         return [upward, level, vector]
 
     def _place_blocks(self, slots: np.ndarray) -> None:
@@ -194,6 +213,7 @@ class WallJump(Scene):
         bodies = self.bodies
         way = direction[slots]
         way[:, 1] = self.jump_start_y[slots] + JUMP_HEIGHT - bodies.position[slots, 1]
+
         change = JUMP_RATE * way - bodies.velocity[slots]
         length = np.sqrt(np.einsum("ni,ni->n", change, change))
         bodies.velocity[slots] += change * np.minimum(1.0, JUMP_CHANGE / np.maximum(length, 1e-12))[:, None]

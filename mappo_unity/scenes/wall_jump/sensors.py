@@ -36,19 +36,26 @@ def observe_rays(
     centre, half = np.empty((len(yaw), 1, 3, 3)), np.empty((len(yaw), 1, 3, 3))
     centre[:, 0, 0], centre[:, 0, 1], centre[:, 0, 2] = (0.0, 0.0, WALL_Z), GOAL_CENTRE, block
     half[:, 0, 0], half[:, 0, 1], half[:, 0, 2] = (WALL_HALF_X, 0.0, WALL_HALF_Z), GOAL_HALF, BLOCK_HALF
+
     half[:, 0, 0, 1] = np.maximum(wall_height / 2, 0.0)
     no_wall = wall_height / 2 <= FLOOR_Y
+
+    # level rays need rectangles in plan only, met with what the sphere's radius is at their height
     origin, direction = LEVEL.casts(position, yaw)
     low, high = (centre - half)[..., 1], (centre + half)[..., 1]
     radius = flat_radius(LEVEL.radius, origin[..., 1], low, high)
     level = cast_rectangles(
         origin[..., ::2], direction[..., ::2], radius, centre[..., ::2], half[..., ::2], skip_gap=TOUCH_GAP
     )
+
     origin, direction = UPWARD.casts(position, yaw)
     # rays that start above the block rise away from it: nearly always they need no cast at it
     seen = 3 if (origin[..., 1] < high[:, :, 2] + UPWARD.cast_radius).any() else 2
+
     local, half = (origin - centre)[:, :, :seen], half[:, :, :seen]
     upward = cast_boxes(local, direction, UPWARD.cast_radius, half, TOUCH_GAP)
+
     level[no_wall, :, 0] = np.inf
     upward[no_wall, :, 0] = np.inf
+
     return UPWARD.encode(upward, TAGS[:seen]), LEVEL.encode(level, TAGS)
