@@ -346,7 +346,7 @@ def test_events_hold_the_numbers_without_nan(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
 def test_missing_logger_names_the_extra(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda package: None)
-    with pytest.raises(ConfigError, match=rf"log\.backends has {name}") as caught:
+    with pytest.raises(ConfigError, match=rf"log\.loggers has {name}") as caught:
         RunLog(LogConfig(loggers=[LoggerKind[name]]), tmp_path / "run", 1000)
     assert install_command(name) in str(caught.value)
     assert not (tmp_path / "run").exists()

@@ -147,8 +147,8 @@ def to_config(tree: DictConfig) -> Config:
 
 def compose_plain(lines: list[str], schema: type) -> Any:
     """Build a dataclass without presets (mappo-eval) from its defaults and overrides; raise ConfigError."""
-    check_form(lines, schema)
     lines = literal_lines(lines, schema)
+    check_form(lines, schema)
     check_overrides(lines, schema, {})
 
     tree = OmegaConf.structured(schema)
