@@ -253,7 +253,7 @@ class TestFailures:
             ("version", 0, "speaks version '2.0.0' of the ML-Agents protocol .package 9.9.9.*1.5.0"),
             ("exit", 0, "ended while it started: exit code 7; its log: .*Player-0"),
             ("hang", 0, "did not connect within env.timeout_s=3: it may need env.no_graphics=true"),
-            ("hang", 2, "did not answer within env.timeout_s=3: no agent asks.*DecisionRequester"),
+            ("hang", 2, "did not answer within env.timeout_s=3: no agent requested.*DecisionRequester"),
         ],
     )
     def test_a_player_that_never_worked_is_a_mistake_in_the_options(
@@ -301,7 +301,7 @@ class TestFailures:
         from mappo_unity.envs import unity_env
 
         monkeypatch.setattr(unity_env, "MAX_SILENT_STEPS", 50)
-        with pytest.raises(ConfigError, match="no behavior with an agent that asks"):
+        with pytest.raises(ConfigError, match="no behavior with an agent that requests"):
             unity_env.UnityEnv(make_env_function(options(bad("silent", 2), tmp_path)))
 
 

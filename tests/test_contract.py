@@ -151,7 +151,7 @@ def test_an_environment_in_which_nobody_ever_asks(caplog: Any) -> None:
     with pytest.raises(ContractError, match=r"reset\(\) returned without any record"):
         check_env(Silent(specs), steps=5)
     with pytest.raises(
-        ConfigError, match="no behavior with an agent that asks.*of .'Crew.team=0'. in 2000 steps"
+        ConfigError, match="no behavior with an agent that requests.*of .'Crew.team=0'. in 2000 steps"
     ):
         UnityEnv(lambda seed: Silent(specs))
     with pytest.raises(ConfigError, match="no agent asked for a decision in 2000 environment steps"):

@@ -186,7 +186,7 @@ def test_departed_members_train_the_critic_and_not_the_policy():
     batch["departed"] = batch["next", "departed"] = ~acting
     rows, _ = learner._prepare(batch)
     assert rows["actor_learns"][:, 1].sum() == 0
-    assert rows["critic_learns"][:, 1].sum() == rows["valued"][:, 0].sum() > 0
+    assert rows["critic_learns"][:, 1].sum() == rows["critic_learns"][:, 0].sum() > 0
     one, two = copy.deepcopy(learner), copy.deepcopy(learner)
     other = rows.clone()
     other["value_target"][:, 1] += 5.0
