@@ -140,7 +140,7 @@ def test_a_run_leaves_its_record(training: FakeTraining, capsys: pytest.CaptureF
     config, given_folder, checkpoint = training.calls[0]
     assert (config.seed, config.ppo.lr, given_folder, checkpoint) == (4, 1e-3, folder, None)
     saved = yaml.safe_load((folder / "config.yaml").read_text())
-    assert saved["ppo"]["lr"] == 1e-3 and saved["log"]["backends"] == ["tensorboard"]
+    assert saved["ppo"]["lr"] == 1e-3 and saved["log"]["loggers"] == ["tensorboard"]
     assert set(saved) == set(vars(Config()))
     assert yaml.safe_load((folder / "overrides.yaml").read_text())[0]["overrides"] == [
         "seed=4",
@@ -475,7 +475,7 @@ def test_what_a_file_system_refuses_is_one_line(
     def fail(lines: list[str]) -> int:
         raise PermissionError(13, "Permission denied", "somewhere/config.yaml")
 
-    monkeypatch.setattr("mappo_unity.cli._eval_command", fail)
+    monkeypatch.setattr("mappo_unity.cli.eval.run", fail)
     assert eval_main(["run=a"]) == 2
     assert capsys.readouterr().err == "mappo-eval: somewhere/config.yaml: Permission denied\n"
 

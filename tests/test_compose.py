@@ -360,7 +360,7 @@ def test_evaluation_options() -> None:
         (["run=x", "opponent="], "opponent= is empty"),
         (["run=x", "episode=3"], "did you mean episodes"),
         (["run=x", "deterministic=2"], "true or false"),
-        (["run=x", "seed=1,2"], "seed takes one value here"),
+        (["run=x", "seed=1,2"], "seed=1,2: seed takes one value; a text with a comma"),
     ):
         with pytest.raises(ConfigError, match=word):
             compose_plain(lines, EvalConfig)

@@ -127,7 +127,7 @@ def test_an_opengl_that_keeps_mujoco_from_loading(monkeypatch: pytest.MonkeyPatc
         raise AttributeError("'NoneType' object has no attribute 'glGetError'")
 
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setattr("mappo_unity.viewing.screens.importlib.import_module", fail)
+    monkeypatch.setattr("mappo_unity.scenes.mujoco_check.importlib.import_module", fail)
     code, text = examine()
     assert code == 1 and "environment variable MUJOCO_GL=osmesa ('NoneType' object has no attribute" in text
     assert "unset it, or set it to egl or osmesa and install that" in text
@@ -219,6 +219,6 @@ def test_options_out_of_range_are_named(option, value):
 
 
 def test_a_duration_must_be_finite() -> None:
-    for value, words in ((float("inf"), "must be > 0, and finite"), (0.0, "must be > 0")):
+    for value, words in ((float("inf"), "must be > 0 and finite"), (0.0, "must be > 0 and finite")):
         with pytest.raises(ConfigError, match=f"--timeout {value:g} is out of range: it {words}$"):
             check_duration("--timeout", value)

@@ -89,7 +89,7 @@ ONNX = "ball/checkpoints/best.onnx"
 TOLD = [
     (
         "train resume=ball/checkpoints/best.onnx",
-        "is an ONNX file: it holds a policy, but not what a training",
+        "is an ONNX file: it holds a policy, but not what resuming needs",
     ),
     ("train resume=ball/checkpoints/best.onnx", "its run: resume=ball"),
     (

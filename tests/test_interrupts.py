@@ -71,9 +71,10 @@ def test_a_second_interrupt_while_python_ends_adds_nothing():
     code = (
         "import atexit, os, signal, sys\n"
         "from mappo_unity import cli\n"
+        "import mappo_unity.cli.eval\n"
         "def interrupted(lines):\n"
         "    raise KeyboardInterrupt\n"
-        "cli._eval_command = interrupted\n"
+        "cli.eval.run = interrupted\n"
         "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
         "sys.argv = ['mappo-eval', 'run=a']\n"
         "sys.exit(cli.eval_main())\n"

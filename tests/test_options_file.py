@@ -23,7 +23,7 @@ from mappo_unity.training.sweep import run_sweep
 def _training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     module = ModuleType("mappo_unity.training.trainer")
 
-    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Any:
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None, *show: object) -> Any:
         (folder / "metrics.csv").write_text("agent_steps\n")
         return fake_training.Outcome()
 

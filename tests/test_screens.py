@@ -17,7 +17,7 @@ def test_an_opengl_that_mujoco_cannot_load(monkeypatch: pytest.MonkeyPatch) -> N
     def fail(name: str) -> None:
         raise RuntimeError(f"invalid value\nfor {name}")
 
-    monkeypatch.setattr("mappo_unity.viewing.screens.importlib.import_module", fail)
+    monkeypatch.setattr("mappo_unity.scenes.mujoco_check.importlib.import_module", fail)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     check_mujoco()
     monkeypatch.setenv("MUJOCO_GL", "nonsense")

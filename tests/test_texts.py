@@ -54,14 +54,14 @@ def training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
     """Stand in for what trains; keep the folders that were trained in."""
     folders: list[Path] = []
 
-    def train(cfg: Config, folder: Path, checkpoint: Path | None = None) -> Any:
+    def train(cfg: Config, folder: Path, checkpoint: Path | None = None, *show: object) -> Any:
         folders.append(folder)
         (folder / "metrics.csv").write_text("agent_steps\n")
         return fake_training.Outcome()
 
     fakes = {
-        "train": {"train": train, "why_over": lambda cfg, path: None},
-        "checkpoint": {"newest_good": lambda where: (where / "checkpoints" / "step_1.pt", [])},
+        "training.trainer": {"train": train, "why_over": fake_training.why_over},
+        "runs.checkpoint": {"newest_good": lambda where: (where / "checkpoints" / "step_1.pt", [])},
     }
     for name, functions in fakes.items():
         module = ModuleType(f"mappo_unity.{name}")
@@ -236,25 +236,35 @@ def test_a_sweep_in_a_folder_of_any_letters(training: list[Path]) -> None:
 
 
 def test_a_sweep_over_files_of_any_letters(training: list[Path]) -> None:
-    lines = ["env=unity", "env.file_name=/x/jürgen/a,/x/b=2/c", "behaviors.ボール.ppo.lr=1e-3,1e-4"]
+    for player in map(Path, ("jürgen/a", "b=2/c")):
+        player.parent.mkdir()
+        player.write_text("#!/bin/sh\n")
+        player.chmod(0o755)
+    lines = ["env=unity", "env.file_name=jürgen/a,b=2/c", "behaviors.ボール.ppo.lr=1e-3,1e-4"]
     assert train_main(["-m", *lines]) == 0
     configs = [load_config(folder / "config.yaml") for folder in training]
-    assert [config.env.file_name for config in configs] == ["/x/jürgen/a"] * 2 + ["/x/b=2/c"] * 2
+    assert [config.env.file_name for config in configs] == ["jürgen/a"] * 2 + ["b=2/c"] * 2
     assert [config.behaviors["ボール"]["ppo"]["lr"] for config in configs] == [1e-3, 1e-4] * 2
     (table,) = Path("outputs/multirun").rglob("results.csv")
     head, first, *_ = table.read_text(encoding="utf-8").splitlines()
-    assert head.startswith("job,env,env.file_name,behaviors.ボール.ppo.lr") and "/x/jürgen/a" in first
+    assert head.startswith("job,env,env.file_name,behaviors.ボール.ppo.lr") and "jürgen/a" in first
 
 
 @pytest.mark.parametrize(
-    ("main", "name"), [(eval_main, "jürgen"), (export_main, "a=b, (c) [d]"), (play_main, "🏆's")]
+    ("main", "name", "more"),
+    [
+        (eval_main, "jürgen", []),
+        (export_main, "a=b, (c) [d]", []),
+        (play_main, "🏆's", ["video=my.gif"]),
+    ],
 )
 def test_a_path_that_is_missing_is_named_as_it_is(
-    main: Any, name: str, training: list[Path], capsys: pytest.CaptureFixture[str]
+    main: Any, name: str, more: list[str], training: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert train_main(["hydra.run.dir=mine"]) == 0
-    assert main([f"run=/nowhere/{name}"]) == 2
-    assert f"run=/nowhere/{name} does not exist; newest runs below .: mine" in capsys.readouterr().err
+    assert main([f"run=/nowhere/{name}", *more]) == 2
+    message = capsys.readouterr().err
+    assert f"run=/nowhere/{name} does not exist" in message and "newest runs below .: mine" in message
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a player's file has another form there")
@@ -263,7 +273,8 @@ def test_a_path_that_is_missing_is_named_as_it_is(
 def test_a_player_is_found_in_a_folder_of_any_letters(folder: str, name: str, tmp_path: Path) -> None:
     player = tmp_path / folder / name
     player.parent.mkdir()
-    player.touch(0o755)
+    player.write_text("#!/bin/sh\n")
+    player.chmod(0o755)
     assert find_executable(str(player)) == player
     if folder != "old.x86 builds":  # from which ML-Agents takes the extension, wherever it stands
         assert find_executable(str(player.with_suffix(""))) == player

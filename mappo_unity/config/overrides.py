@@ -231,8 +231,10 @@ def _check_type(key: str, value: Any, option: Option, schema: type) -> None:
     _check_size(key, value, option)
     # OmegaConf by itself takes numbers and words such as yes for true and false
     fits = not (option.type is bool and not isinstance(value, bool))
+    # a name of the user's may be a number in one line and named values in the next
+    tree = OmegaConf.structured(schema) if option.is_open else _scratch(schema)
     try:
-        OmegaConf.update(_scratch(schema), key, value, merge=True, force_add=option.is_open)
+        OmegaConf.update(tree, key, value, merge=True, force_add=option.is_open)
     except (OmegaConfBaseException, ValueError):
         fits = False
     if fits:

@@ -7,6 +7,7 @@ nothing, or a `ConfigError` that says how it is written.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table
@@ -22,6 +23,9 @@ _COMMANDS = {
     "mappo-export": ExportConfig,
 }
 """The commands that take option=value, and their options."""
+
+# with an even number of backslashes before it; an odd number makes it a text
+_INTERPOLATION = re.compile(r"(?<!\\)(?:\\\\)*\$\{")
 
 
 def check_form(lines: Sequence[str], schema: type) -> None:
@@ -42,7 +46,7 @@ def check_form(lines: Sequence[str], schema: type) -> None:
 
         if key not in table:
             _check_other_command(key, schema, table)
-        if "${" in line:
+        if _INTERPOLATION.search(line):
             raise ConfigError(f"{line}: ${{...}} is for the options of mappo-train; write the value itself")
 
     # only now: of switches and words alone the grammar's own message says too little

@@ -88,11 +88,13 @@ def load_factory(path: str, name: str) -> Callable[..., Any]:
         kind = with_article(type(function).__name__)
         raise ConfigError(f"{name}: {function_name} is {kind}, but must be a function that returns a BaseEnv")
 
-    names = sorted(n for n, value in vars(module).items() if _is_own_function(value, module_name))
+    # What the module imported may be meant, but is not worth a list.
+    public = {n: value for n, value in vars(module).items() if callable(value) and not n.startswith("_")}
+    names = sorted(n for n, value in public.items() if getattr(value, "__module__", None) == module_name)
     more = ", ..." if len(names) > 20 else ""
 
     raise ConfigError(
-        f"{name}: {module_name} has no function {function_name!r}{did_you_mean(function_name, names)}; "
+        f"{name}: {module_name} has no function {function_name!r}{did_you_mean(function_name, public)}; "
         f"it has {', '.join(names[:20]) or 'none'}{more}"
     )
 
@@ -119,7 +121,3 @@ def explain_error(error: BaseException, who: str) -> ConfigError:
 
     mistake.details = tuple("".join(report.format()).splitlines())
     return mistake
-
-
-def _is_own_function(value: Any, module: str) -> bool:
-    return callable(value) and getattr(value, "__module__", None) == module
