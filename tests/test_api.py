@@ -39,7 +39,7 @@ def test_train_takes_the_options_of_the_command_and_prints_nothing(capfd):
 
     resumed = train("resume=run", "max_steps=256", progress=True)
     assert resumed.agent_steps == 256
-    assert "continuing from" in capfd.readouterr().out
+    assert "resuming from" in capfd.readouterr().out
 
 
 def test_a_callback_ends_a_run():

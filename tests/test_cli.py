@@ -304,7 +304,7 @@ def test_printed_commands_can_be_pasted(
 ) -> None:
     assert train_main([f'output_dir="{name}"']) == 0
     (folder,) = (Path(name) / "3DBall").iterdir()
-    (hint,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("continue:"))
+    (hint,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("resume:"))
     command, *lines = shlex.split(hint.partition(":")[2])
     assert command == "mappo-train" and train_main(lines) == 0
     assert training.calls[1][1] == folder

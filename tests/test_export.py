@@ -142,7 +142,7 @@ def test_a_failed_export_is_one_line_and_ends_no_run(tmp_path, monkeypatch):
     assert outcome.status == "finished" and outcome.agent_steps == 3 * AREAS * ROUNDS
     assert outcome.last_checkpoint is not None and outcome.last_checkpoint.is_file()
     failures = [text for text in messages if not text.startswith("run folder: ")]
-    assert len(failures) == 1 and failures[0].endswith("(the run goes on): a new failure")
+    assert len(failures) == 1 and failures[0].endswith("(training continues): a new failure")
     assert not list(tmp_path.rglob("*.onnx"))
 
 

@@ -218,7 +218,7 @@ def test_a_run_and_its_printed_commands(
     assert train_main([f"hydra.run.dir={folder}".replace("${", r"\${")]) == 0
     assert training == [folder]
     text = capsys.readouterr().out
-    command, *lines = hinted_command(text, "continue:")
+    command, *lines = hinted_command(text, "resume:")
     assert command == "mappo-train" and train_main(lines) == 0
     assert training == [folder] * 2
     command, line = hinted_command(text, "evaluate:")

@@ -344,4 +344,4 @@ def test_the_folder_is_named_when_the_run_begins(tmp_path, monkeypatch, capsys):
     assert train_main(["resume=mine", "max_steps=16", "behaviors.Nobody.ppo.lr=1"]) == 2
     assert capsys.readouterr().out == ""
     assert train_main(["resume=mine", "max_steps=16"]) == 0
-    assert capsys.readouterr().out.startswith("continuing from mine")
+    assert capsys.readouterr().out.startswith("resuming from mine")

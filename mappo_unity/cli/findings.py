@@ -14,11 +14,11 @@ CURES = {
     "protobuf": "messages are parsed in pure Python, 10 to 80 times slower: pip install --upgrade protobuf, "
     "and unset PROTOCOL_BUFFERS_PYTHON_IMPLEMENTATION",
     "TIME_WAIT": "a run that ended less than a minute ago holds it (TIME_WAIT); it comes free by itself",
-    "in use": "another training or a game started by hand holds it: end that one, or use another port "
+    "in use": "another training run or a game started by hand holds it: end that one, or use another port "
     "(env.port=N, here --port N) on both sides",
     FORBIDDEN: "this user may not listen on it: use a port from 1024 up (env.port=N, here --port N)",
     "display": "no display: start players with env.no_graphics=true (no cameras then), or under xvfb-run",
-    "no behavior": "the player runs, but no agent asks for a decision: give every Agent a DecisionRequester "
+    "no behavior": "the player runs, but no agent requested a decision: give every Agent a DecisionRequester "
     "(or call RequestDecision), set Behavior Type to Default, and see that the agents' objects are active",
     "rhythm": "no agent asked again after its first decision: is DecisionRequester's period very long, or "
     "are the agents destroyed without EndEpisode?",

@@ -18,7 +18,7 @@ Train policies with MAPPO on an ML-Agents environment.
 Usage:
   mappo-train [option=value ...]            train; the results are in outputs/<env>/<date>_<time>
   mappo-train -m [option=value,value ...]   sweep: one run for each combination
-  mappo-train resume=RUN [option=value ...] continue a run folder or a checkpoint
+  mappo-train resume=RUN [option=value ...] resume a run folder or a checkpoint
   mappo-train --config FILE [option=value ...]  with the options of a YAML file, such as a run's config.yaml
   mappo-train --help | --version
 

@@ -52,7 +52,7 @@ def run_summary(outcome: Outcome, folder: Path) -> list[str]:
         *lines,
         *_rollback_lines(outcome.updates),
         f"evaluate:    mappo-eval {shell_argument('run', folder)}",
-        f"continue:    mappo-train {shell_argument('resume', folder)}",
+        f"resume:      mappo-train {shell_argument('resume', folder)}",
         f"curves:      tensorboard --logdir {shell_word(folder)}",
     ]
 

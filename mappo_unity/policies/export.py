@@ -151,7 +151,7 @@ class RunExports:
             reason = " ".join(str(error).split()) or type(error).__name__
             if reason not in self._warned:
                 self._warned.add(reason)
-                self.message(f"no ONNX file was written for {path} (the run goes on): {reason}")
+                self.message(f"no ONNX file was written for {path} (training continues): {reason}")
         else:
             self._stale = self._stale and name != checkpoint.BEST
 

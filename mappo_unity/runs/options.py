@@ -28,7 +28,7 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
     chosen = last_value(lines, "env")
     if chosen is not None and chosen != saved.env.name:
         raise ConfigError(
-            f"env={chosen} differs from the run's env={saved.env.name}: a run goes on in its own env; "
+            f"env={chosen} differs from the run's env={saved.env.name}: a run is resumed in its own env; "
             "leave env out, or start a new run without resume"
         )
 
@@ -36,7 +36,7 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
     for key in ("env.name", "output_dir", "hydra.run.dir"):
         if last_value(rest, key) is not None:
             raise ConfigError(
-                f"{key} cannot change with resume: the run goes on in its own folder {base.parent}"
+                f"{key} cannot change with resume: a run is resumed in its own folder {base.parent}"
             )
 
     config = compose_config(rest, base).config

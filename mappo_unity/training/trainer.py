@@ -64,7 +64,7 @@ def train(
         resume_steps = state.agent_steps if resume_from is not None else None
         with RunLog(cfg.log, folder, cfg.max_steps, resume_steps, console) as log:
             # not before: until here something may be refused
-            log.message(f"run folder: {folder}" if resume_from is None else f"continuing from {resume_from}")
+            log.message(f"run folder: {folder}" if resume_from is None else f"resuming from {resume_from}")
             for note in setup.notes:
                 log.message(note)
             exports = RunExports(folder, log.message) if cfg.export_onnx else None
