@@ -87,6 +87,7 @@ def test_delayed_reward_is_discounted(tmp_path):
     assert value[~early].mean().item() == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("actions", ["continuous", "discrete", "mixed"])
 def test_action_dependent_reward(tmp_path, actions):
     _, batch = learn("ActionReward", tmp_path, 70, actions)
@@ -111,7 +112,10 @@ def test_credit_goes_to_the_member_that_earned_it(tmp_path, shared):
     assert chosen(batch)[..., 0].mean() > 0.9
 
 
-@pytest.mark.parametrize("kind", list(CriticKind))
+@pytest.mark.parametrize(
+    "kind",
+    [k if k is CriticKind.central else pytest.param(k, marks=pytest.mark.slow) for k in CriticKind],
+)
 def test_only_critics_that_see_the_team_know_what_a_mate_knows(tmp_path, kind):
     setup, batch = learn("MateKnows", tmp_path, 80, model={"critic": kind})
     sign = batch["observation"][..., 0, 0]
@@ -128,6 +132,7 @@ def test_a_member_that_ends_early_learns_from_what_its_team_earns_later(tmp_path
     assert chosen(batch)[..., 0][first].mean() > 0.9
 
 
+@pytest.mark.slow
 def test_without_death_masking_it_learns_nothing(tmp_path):
     _, batch = learn("EarlyDeath", tmp_path, 80, ppo={"death_masking": False, "lr": 1e-2}, rounds=12)
     first = batch["acting"][..., 0, 0]
@@ -150,7 +155,7 @@ def test_an_agent_whose_id_changes(tmp_path):
 @pytest.mark.parametrize(
     ("probe", "expected"),
     [
-        ("TimeLimit", 1 / (1 - GAMMA)),
+        pytest.param("TimeLimit", 1 / (1 - GAMMA), marks=pytest.mark.slow),
         ("RealEnd", np.mean([sum(GAMMA**k for k in range(n)) for n in range(1, 6)])),
     ],
 )
