@@ -1,8 +1,4 @@
-"""Options to a running BaseEnv.
-
-In: `EnvConfig`. Out: a function ``seed -> BaseEnv``. The only module that knows what runs an environment
-(with `link`, which knows how players are talked to); must not know TorchRL.
-"""
+"""How options become the function that opens an environment: a scene, players, or a user's own factory."""
 
 from __future__ import annotations
 
@@ -80,6 +76,7 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
         return PlayerOptions(
             executable,
             folder / f"Player-{number}.log",
+            # only the Editor must be told its port; for players the system picks a free one (0)
             port=cfg.port or EDITOR_PORT if cfg.backend is Backend.editor else 0,
             timeout_s=cfg.timeout_s,
             arguments=list(cfg.player_args),
@@ -91,6 +88,7 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
 
     def start(number: int, seed: int) -> RestartingPlayer:
         name = f"player {number}" if cfg.num_players > 1 else _describe(cfg)
+        # a player's seed is an int32 that is not negative
         first = (seed + PLAYER_STRIDE * number) % 2**31
         return RestartingPlayer(lambda s: UnityPlayer(options(number), s), first, cfg.max_restarts, name)
 

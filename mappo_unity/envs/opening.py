@@ -1,8 +1,4 @@
-"""What an environment shows at first: its behaviors, and how many teams and agents they have.
-
-In: a BaseEnv that was reset, stepped here until somebody asks. Out: a `First` for each behavior. Knows
-nothing of what is done with them.
-"""
+"""What an environment shows at first: its behaviors, and how many teams and agents they have."""
 
 from __future__ import annotations
 
@@ -31,12 +27,14 @@ class First(NamedTuple):
 
 
 def first_results(env: BaseEnv, max_steps: int) -> dict[str, First]:
-    """Step an environment until somebody asks; return its behaviors by name.
+    """Step an environment until an agent requests a decision; return its behaviors by name.
 
     Raises:
-        EnvironmentDataError: nobody asks within `max_steps`, or what it shows breaks the contract.
+        EnvironmentDataError: no agent requests a decision within `max_steps`, or what it shows breaks the
+            contract.
     """
     for attempt in range(max_steps):
+        # anew after each step: a player shows a behavior only with its first agents
         check_specs(env.behavior_specs)
         behaviors = {}
         for name, spec in env.behavior_specs.items():
@@ -66,6 +64,7 @@ def team_sizes(behaviors: Mapping[str, First]) -> dict[str, tuple[int, int]]:
 
     for name, first in behaviors.items():
         teams, members = count_teams(first.decision.agent_id, first.decision.group_id)
+        # sides of one policy are stacked, so they get equally many slots
         seen = sizes.get(keys.policy_name(name), (1, 1))
         sizes[keys.policy_name(name)] = max(seen[0], teams), max(seen[1], members)
 

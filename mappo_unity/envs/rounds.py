@@ -1,14 +1,13 @@
 """One behavior's side of a round: records of a BaseEnv gathered into arrays of slots.
 
-In: DecisionSteps and TerminalSteps (checked by `record_check`), as many results as a round takes. Out: numpy
-arrays ``[N, ...]`` (N = G * A slots), ready to become tensors. Knows nothing of TensorDict.
-(`np.count_nonzero` asks for flags in a fifth of the time of `any` and `all`.)
+Arrays are ``[N, ...]`` with N = G * A slots. Records have passed `RecordCheck` before they come here. Flags
+are tested with `np.count_nonzero`, which takes a fifth of the time of `any` and `all`.
 
-A round begins when actions are handed over and ends with the first result in which anybody is
-asked. What arrives in it for a slot is added up: the reward of a terminal step belongs to the row
+A round begins when actions are handed over and ends with the first result in which an agent requests a
+decision. What arrives in it for a slot is added up: the reward of a terminal step belongs to the row
 that the round closes, the observation of a decision step opens the next row.
 
-Death masking: an agent that ends for good while its team plays on *departs*. Its slot then goes on
+Death masking: an agent that ends for good while its team plays on *departs*. Its slot then stays
 without acting, earns what its team earns, and is done when the team's episode is.
 """
 
@@ -67,6 +66,7 @@ class BehaviorState:
     def begin_round(self) -> None:
         """Forget the last round's rewards and ends."""
         count = len(self.acting)
+        # new arrays, not zeroed ones: `next_entries` handed the old ones out without a copy
         self.reward = np.zeros(count, np.float32)
         self.group_reward = np.zeros(count, np.float32)
         self.terminated = np.zeros(count, bool)
@@ -78,6 +78,7 @@ class BehaviorState:
 
     def add(self, decision: DecisionSteps, terminal: TerminalSteps) -> None:
         """Take one result in: first the ends, then the new decisions."""
+        # an agent that is in both has ended, and its decision is the first of its next episode
         if len(terminal):
             self._add_terminal(terminal)
         if len(decision):
@@ -96,6 +97,7 @@ class BehaviorState:
 
     def end_round(self) -> None:
         """Fix `end_obs`: the terminal observation where an episode ended, else the newest."""
+        # copies: these are handed out, while `obs` is written into again
         self.end_obs = [o.copy() for o in self.obs]
         for rows, observations in self._terminal_obs:
             for own, new in zip(self.end_obs, observations):
@@ -110,7 +112,7 @@ class BehaviorState:
         self.begin_round()
 
     def actions(self, action: np.ndarray, limit: float) -> ActionTuple:
-        """Return the actions of the agents that were asked, in the order in which they were.
+        """Return the actions of the agents that requested a decision, in the order of their requests.
 
         Args:
             action: ``[N, C + K]``: continuous columns first, then branch indices.
@@ -132,11 +134,12 @@ class BehaviorState:
     def _add_terminal(self, terminal: TerminalSteps) -> None:
         slots = self.slots.lookup(terminal.agent_id)
         own = slots >= 0
+        # an end counts while its agent plays: not a second time, and not after it has departed
         if np.count_nonzero(own):
             own[own] = self.present[slots[own]] & ~self.departed[slots[own]]
 
         count = np.count_nonzero(own)
-        if count < len(own):  # ends of agents that were never asked here: nobody's row
+        if count < len(own):  # ends of agents that never requested a decision: nobody's row
             if not count:
                 return
             rows = slots[own]
@@ -149,12 +152,14 @@ class BehaviorState:
         self.group_reward[rows] += terminal.group_reward[own]
         self._finish_episodes(rows, terminal.reward[own], terminal.group_reward[own], interrupted)
         self.slots.ended[rows] = True
+        # before `_team_plays_on`, which counts who is present
         self.present[rows] = False
 
         # who ends while its team plays on departs: its slot stays, sees zeros and earns on
         leaves = np.zeros(len(rows), bool)
         if self.death_masking and self.slots.team_size > 1:
             leaves = self._team_plays_on(rows) & ~interrupted
+            # before these depart too: they have received their group reward above
             self._settle_departed(rows[~leaves], rows, terminal.group_reward[own])
             self.departed[rows[leaves]] = True
             self.present[rows[leaves]] = True
@@ -198,6 +203,7 @@ class BehaviorState:
         for own, new in zip(self.obs, decision.obs):
             own[slots] = new
         if self.mask.shape[1]:
+            # ML-Agents marks what is forbidden, we mark what is allowed
             masks = decision.action_mask
             self.mask[slots] = True if masks is None else ~np.concatenate(masks, axis=1)
 
@@ -211,6 +217,7 @@ class BehaviorState:
         self.group_return[rows] += group_reward
 
         for agent, slot, cut in zip(self.slots.agents_of(rows), rows.tolist(), interrupted.tolist()):
+            # an episode that a crash cut off says nothing about the policy
             if self.crashed[slot]:
                 continue
             returns = float(self.individual_return[slot]), float(self.group_return[slot])
@@ -239,6 +246,7 @@ class BehaviorState:
 
     def _share_group_reward(self, rows: np.ndarray, group_reward: np.ndarray) -> None:
         """Give the departed what a team mate of theirs received as group reward just now."""
+        # Unity adds a group reward to every member: the first that reports stands for its team
         teams, first = np.unique(rows // self.slots.team_size, return_index=True)
 
         share = np.zeros(self.slots.num_teams, np.float32)

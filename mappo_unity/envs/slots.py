@@ -1,9 +1,8 @@
 """Slots of one behavior: which row of the batch holds which agent.
 
-In: agent ids and group ids as a BaseEnv reports them. Out: flat slot numbers ``team * A + member``.
-Agents of one group share a team; an agent without a group is a team of its own. A slot belongs to
-its agent until the agent has ended *and* somebody else needs the place, so an agent that goes on
-under its old id after a terminal step keeps its slot. Knows nothing of observations or actions.
+Slots are flat numbers ``team * A + member``. Agents of one group share a team; an agent without a group is a
+team of its own. A slot belongs to its agent until the agent has ended *and* somebody else needs the place, so
+an agent that begins its next episode under its old id keeps its slot.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ class SlotTable:
         self.team_key = np.full(num_teams, FREE, np.int64)
         self._slot_of: dict[int, int] = {}
 
-        # mostly the same agents ask in the same order again: these skip the look-ups
+        # mostly the same agents request decisions in the same order again: these skip the look-ups
         self._last_ids = np.zeros(0, np.int64)
         self._last_slots = np.zeros(0, np.int64)
 
@@ -79,6 +78,7 @@ class SlotTable:
             )
 
         slot = team * self.team_size + int(left[0])
+        # who held the slot has ended, and gets another one should it come back
         self._slot_of.pop(int(self.agent_id[slot]), None)
         self._slot_of[agent] = slot
         self.agent_id[slot] = agent
@@ -93,6 +93,7 @@ class SlotTable:
         if len(known):
             return int(known[0])
 
+        # teams never used come first, then those whose members have all ended
         free = np.flatnonzero(self.team_key == FREE)
         if not len(free):
             ended = self.ended.reshape(self.num_teams, self.team_size).all(1)

@@ -1,7 +1,4 @@
-"""Specs of what a `UnityEnv` gives and takes, as TorchRL wants them.
-
-In: behaviors with their slots. Out: Composite specs, one entry a behavior. Knows nothing of rounds played.
-"""
+"""Specs of what a `UnityEnv` gives and takes, as TorchRL wants them."""
 
 from __future__ import annotations
 
@@ -31,6 +28,7 @@ def make_specs(
         for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED):
             entries[key] = Binary(1, (*shape, 1), dtype=torch.bool)
 
+        # without discrete actions there is nothing to mask
         if behavior.mask.shape[1]:
             entries[keys.MASK] = Binary(
                 behavior.mask.shape[1], (*shape, behavior.mask.shape[1]), dtype=torch.bool

@@ -1,7 +1,7 @@
-"""From raw behaviors to what policies see: Stack, CatTensors, Exclude.
+"""The transforms between a `UnityEnv` and its policies: sides are stacked, vector sensors joined.
 
-In: a `UnityEnv`. Out: a `TransformedEnv` with one entry a policy name, holding ``observation``
-(all vector sensors in one) instead of the sensors. Derived from specs alone.
+They give one entry a policy name, which holds ``observation`` (all vector sensors in one) instead of those
+sensors, and are derived from specs alone.
 """
 
 from __future__ import annotations
@@ -81,6 +81,7 @@ class TransformedUnityEnv(TransformedEnv):
 
     def _find_own_keys(self) -> dict[str, set[str]]:
         transforms = self.transform.transforms if isinstance(self.transform, Compose) else [self.transform]
+        # exact types: a subclass may do more
         if not all(type(transform) in (Stack, CatTensors, ExcludeTransform) for transform in transforms):
             return {}
 
@@ -117,6 +118,7 @@ def _concatenate(env: UnityEnv, policy: str, behavior: str) -> list[Transform]:
     if not vectors:
         return []
     return [
+        # not sorted: by name obs_10 would come before obs_2
         CatTensors(in_keys=vectors, out_key=(policy, keys.OBS), dim=-1, sort=False, del_keys=False),
         ExcludeTransform(*vectors),
     ]

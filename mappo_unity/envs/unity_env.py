@@ -1,13 +1,11 @@
-"""UnityEnv: a BaseEnv as a TorchRL environment of batched slots.
+"""`UnityEnv`: a BaseEnv as a TorchRL environment of batched slots.
 
-In: any `mlagents_envs.base_env.BaseEnv`. Out: TensorDicts with one entry a behavior, ``[G, A, ...]``
-(see `keys`). This module alone knows DecisionSteps and TerminalSteps (with `rounds` and `slots`);
-it must not know what runs below the BaseEnv, nor what learns above.
+Its TensorDicts hold one entry a behavior, ``[G, A, ...]`` (see `keys`).
 
-One ``step`` is one round: hand actions to the agents that asked, then step the BaseEnv until
-somebody asks again. Agents that end go on by themselves (auto-reset in the scene), so a partial
-reset only hands out the first observation of the next episode; the scene itself is reset by a full
-``reset()`` alone, and a full reset right after another does nothing.
+One ``step`` is one round: hand actions to the agents that requested a decision, then step the BaseEnv until
+an agent requests one again. Agents that end begin their next episode by themselves (auto-reset in the scene),
+so a partial reset only hands out the first observation of the next episode; the scene itself is reset by a
+full ``reset()`` alone, and a full reset right after another does nothing.
 """
 
 from __future__ import annotations
@@ -162,6 +160,7 @@ class UnityEnv(EnvBase):
             if len(behavior.order):
                 action = tensordict.get((self.entry_of[name], keys.ACTION)).reshape(len(behavior.acting), -1)
                 self.base_env.set_actions(name, behavior.actions(action.numpy(), self.action_limit))
+            # after `actions`, which reads the order of the requests that this forgets
             behavior.begin_round()
 
         self._untouched = False
@@ -197,6 +196,7 @@ class UnityEnv(EnvBase):
         self._untouched = True
 
     def _full_reset(self) -> None:
+        # after opening, another reset or `set_state`: what stands there is handed out as it is
         if self._untouched:
             return
 
@@ -224,7 +224,7 @@ class UnityEnv(EnvBase):
             behavior.end_round()
 
     def _take_results(self) -> bool:
-        """Take in what the behaviors' agents report; return whether somebody asks."""
+        """Take in what the behaviors' agents report; return whether one requests a decision."""
         crashed = getattr(self.base_env, "crashed_agents", None)  # only players have it, see RestartingPlayer
         asked = False
 
@@ -271,6 +271,6 @@ class UnityEnv(EnvBase):
         return False
 
     def root(self) -> TensorDict:
-        """Return what the agents are asked now: entries as `reset` gives them, ends all False."""
+        """Return what the agents are to act on now: entries as `reset` gives them, ends all False."""
         entries = {self.entry_of[name]: root_entries(b) for name, b in self._behaviors.items()}
         return unchecked(entries, self.batch_size)

@@ -1,7 +1,7 @@
 """Actor and critic of one policy name, from its specs and the model options.
 
-In: layouts read from the environment, `ModelConfig`. Out: TensorDict modules that read observations
-(and ``action_mask``) and write ``action``, ``action_log_prob`` and ``state_value``.
+Both are TensorDict modules, which read observations (and ``action_mask``) and write ``action``,
+``action_log_prob`` and ``state_value``.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ class Actor(nn.Module):
         self.encoder = Encoder(obs, cfg.normalize_obs)
 
         outputs = layout.continuous + layout.num_logits
+        # the small last gain makes first actions almost independent of what is observed
         self.net = make_mlp(self.encoder.size, list(cfg.hidden), outputs, cfg.activation, last_gain=0.01)
 
         self.layout = layout
@@ -46,6 +47,7 @@ class Actor(nn.Module):
         if not size:
             return out
 
+        # means, logarithms of deviations, logits: the order that `ActionDistribution` reads
         log_std = self.log_std.clamp(*LOG_STD_RANGE).expand(*out.shape[:-1], size)
         if not self.layout.branches:
             return torch.cat([out, log_std], -1)
@@ -81,7 +83,7 @@ class PerMember(nn.Module):
 
 
 class UnityActor(ProbabilisticActor):
-    """The policy of one policy name as a TorchRL actor, which can also be asked for draws alone.
+    """The policy of one policy name as a TorchRL actor, which can also give draws alone.
 
     Args:
         net: observation entries to the parameters ``[..., P]`` of an `ActionDistribution`.
@@ -106,10 +108,11 @@ class UnityActor(ProbabilisticActor):
     def draw(self, entries: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return random actions ``[..., C + K]`` and their log-probabilities ``[...]``, without gradients.
 
-        The same numbers as `forward` writes in exploration; collecting asks here, because on small
+        The same numbers as `forward` writes in exploration; collecting calls this, because on small
         networks the wrappers between `forward` and the network cost more than the network.
         """
         with torch.no_grad():
+            # the network itself, inside its TensorDictModule
             params = self.module[0].module(*[entries.get(key) for key in self.obs_keys])
             mask = entries.get(keys.MASK) if self.layout.branches else None
 
@@ -154,6 +157,7 @@ class JointPolicy(TensorDictModuleBase):
 
     def __init__(self, actors: dict[str, TensorDictModuleBase]) -> None:
         super().__init__()
+        # by number: a module's name may hold no dot, a policy's may
         self.actors = nn.ModuleDict({str(i): actor for i, actor in enumerate(actors.values())})
 
         self.names = list(actors)
@@ -163,6 +167,7 @@ class JointPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write every name's action and log-probability beside its observation."""
+        # only then are the actor's draws what its `forward` would write
         draws = exploration_type() in (None, ExplorationType.RANDOM) and not torch.is_grad_enabled()
 
         for name, inputs, actor in zip(self.names, self.inputs, self.actors.values()):

@@ -10,7 +10,7 @@ row or the end,
     A_k     = delta_k + gamma * gae_lambda * A_next
 
 where V_next, A_next belong to the next row with a value; at a real end both are 0, at an interruption V_next
-is the value of the terminal observation and A_next is 0. Rounds in which the slot was not asked pass both on
+is the value of the terminal observation and A_next is 0. Rounds without a value pass both on
 unchanged. A decision whose outcome has not arrived when the batch ends has no advantage (``known`` is False);
 the rows before it bootstrap from its value. With a value in every round this is GAE (Schulman et al., arXiv
 1506.02438, eq. 16).

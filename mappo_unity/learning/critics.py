@@ -1,6 +1,4 @@
-"""Critics of a team: what its members' values are computed from.
-
-In: every member's observation, who is there. Out: a value in normalised space for every member.
+"""Critics of a team: what its members' values, in the space of `ValueNorm`, are computed from.
 
 `LocalCritic` sees the member alone (IPPO). `CentralCritic` sees all observations of the team side by
 side, flags of who is there, and which member it judges: the agent-specific global state of the MAPPO paper
@@ -55,6 +53,7 @@ class CentralCritic(nn.Module):
         """Return values; the arguments are the observation entries, ``present`` and ``departed``."""
         features, seen = seen_features(self.encoder, inputs)
         joint = self.joint(torch.cat([features.flatten(-2), seen.flatten(-2)], -1))
+        # [..., 1, first] + [A, first]: a one-hot index selects one row of weights
         return self.net(self.activation(joint.unsqueeze(-2) + self.member))
 
 
@@ -93,11 +92,13 @@ class PooledCritic(nn.Module):
         else:
             pooled = self._attend(tokens, seen)
 
+        # the pooled mean does not tell how many there are
         share = (count / self.team_size).expand(*tokens.shape[:-1], 1)
         return self.net(torch.cat([tokens, pooled, share], -1))
 
     def _attend(self, tokens: Tensor, seen: Tensor) -> Tensor:
         assert self.attention is not None
+        # attention takes a single batch dimension
         rows = tokens.flatten(0, -3)
         hidden = seen.flatten(0, -3).squeeze(-1) == 0
         hidden = hidden & ~hidden.all(-1, keepdim=True)  # a team of nobody attends to zeros, not to nothing

@@ -1,8 +1,7 @@
-"""Actions of any Unity action spec through one door: one parameter tensor, one action tensor.
+"""The distribution of actions for any Unity action spec, from one parameter tensor ``[..., P]``.
 
-In: network outputs ``[..., P]``. Out: a `torch.distributions.Distribution` over actions
-``[..., C + K]``: C continuous columns, then K branch indices. A purely discrete action is int64, any
-other float32 (branch indices up to 2**24 are exact in it).
+An action is one tensor ``[..., C + K]``: C continuous columns, then K branch indices. A purely discrete
+action is int64, any other float32 (branch indices up to 2**24 are exact in it).
 
 Continuous columns are Gaussian before the environment clips them to +-3 and divides by 3, as in
 ML-Agents' exported policies.
@@ -143,6 +142,7 @@ class ActionDistribution(Distribution):
         if not self.log_probs:
             return total
 
+        # in an action of both kinds the branch indices are floats
         categories = self.layout.to_categories(value[..., size:].long())
         for column, log_probs in enumerate(self.log_probs):
             total = total + log_probs.gather(-1, categories[..., column : column + 1]).squeeze(-1)
@@ -162,6 +162,7 @@ class ActionDistribution(Distribution):
 
     def _categoricals(self, logits: Tensor, mask: Tensor | None) -> list[Tensor]:
         if mask is not None:
+            # not -inf: times a probability of 0 it would make the entropy nan
             logits = logits.masked_fill(~self.layout.joint_mask(mask), torch.finfo(logits.dtype).min / 4)
 
         return [part.log_softmax(-1) for part in logits.split(list(self.layout.categoricals), -1)]

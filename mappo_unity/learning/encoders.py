@@ -1,8 +1,7 @@
 """Observations of one agent to features: normalised vectors and encoded images.
 
-In: an `ObsLayout` read from a behavior's specs. Out: a module from observation entries
-``[..., O]`` and ``[..., C, H, W]`` to features ``[..., F]``. Normalisation is part of it, so that it is
-saved and exported with the network.
+Vectors ``[..., O]`` and images ``[..., C, H, W]`` become features ``[..., F]``. Normalisation is part of the
+module, so that it is saved and exported with the network.
 """
 
 from __future__ import annotations
@@ -145,13 +144,14 @@ class ImageEncoder(nn.Module):
 
         self.conv = nn.Sequential(*convolutions, nn.Flatten())
 
-        # the size of the features is asked of the convolutions themselves
+        # the convolutions themselves tell the size of their features
         with torch.no_grad():
             flat = self.conv(torch.zeros(1, channels, height, width)).shape[1]
         self.out = nn.Sequential(nn.Linear(flat, IMAGE_FEATURES), nn.SiLU())
 
     def forward(self, image: Tensor) -> Tensor:
         """Return features ``[..., 128]`` of images ``[..., C, H, W]`` (or ``[..., H, W, C]``)."""
+        # convolutions take a single batch dimension
         flat = image.flatten(0, -4)
         flat = flat.permute(0, 3, 1, 2) if self.channels_last else flat
         return self.out(self.conv(flat)).unflatten(0, image.shape[:-3])

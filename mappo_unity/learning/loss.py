@@ -35,7 +35,9 @@ class MaskedClipPPOLoss(ClipPPOLoss):
             entropy_coeff=cfg.entropy_coef,
             critic_coeff=cfg.value_coef * self.huber_delta**2,
             loss_critic_type="smooth_l1" if cfg.value_loss is ValueLoss.huber else "l2",
+            # `PolicyLearner` normalises over the batch, this would do so over a minibatch
             normalize_advantage=False,
+            # values are divided by delta before they are clipped, see `_critic_loss_inputs`
             clip_value=cfg.clip_epsilon / self.huber_delta if cfg.clip_value else None,
             functional=False,
         )

@@ -1,7 +1,4 @@
-"""PPO for one policy name: a batch in, better networks and metrics out.
-
-In: a batch ``[T, ..., A]`` of one policy name, networks, `PPOConfig`. Out: metrics as a dict. Must
-not know environments, collectors, files or other policies.
+"""PPO for one policy name: a batch ``[T, ..., A]`` in, better networks and metrics out.
 
 `PolicyLearner.learn` reads top to bottom: values, advantages, rows, minibatches, statistics.
 """
@@ -53,6 +50,7 @@ class PolicyLearner:
         self.value_norm = ValueNorm(cfg.value_norm_beta, cfg.normalize_values is not ValueNormKind.none)
 
         self.critic_keys = [str(key) for key in critic.in_keys]
+        # the layers that give values, which PopArt rescales
         self.value_layers = [m for m in critic.modules() if isinstance(m, nn.Linear) and m.out_features == 1]
         inputs = [*(str(key) for key in actor.in_keys), *self.critic_keys]
         self.row_keys = list(dict.fromkeys([*inputs, keys.ACTION, keys.LOG_PROB]))
@@ -170,7 +168,7 @@ class PolicyLearner:
         out = torch.zeros(truncated.shape, device=truncated.device)
         where = truncated.flatten(0, -3).any(-2).squeeze(-1)
 
-        # the critic is asked only about rows that need it
+        # the critic runs only on rows that need it
         if where.any():
             rows = following.select(*self.critic_keys).flatten(0, -2)[where]
             out.flatten(0, -3)[where] = self._values(rows)
@@ -265,7 +263,7 @@ class PolicyLearner:
         self.optimizer.load_state_dict(state["optimizer"])
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that continuing needs."""
+        """Return everything that resuming needs."""
         return self._trainable_state() | {
             "value_norm": self.value_norm.state_dict(),
             "updates": self.updates,
@@ -273,7 +271,7 @@ class PolicyLearner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
+        """Resume from what `state_dict` returned."""
         self._load_trainable(state)
         self.value_norm.load_state_dict(state["value_norm"])
         self.rollbacks = int(state["rollbacks"])
@@ -283,6 +281,7 @@ class PolicyLearner:
 def minibatch_rows(cfg: PPOConfig, rows: int, team_size: int) -> int:
     """Return the team rows of a minibatch."""
     if cfg.num_minibatches is not None:
+        # rounded up: rounded down it would give one minibatch too many
         return -(-rows // cfg.num_minibatches)
     return min(rows, max(1, cfg.minibatch_size // team_size))
 

@@ -1,6 +1,5 @@
 """Running statistics of returns, so that the critic learns in a normalised space.
 
-In: value targets in the reward's own scale. Out: normalised targets, and critic outputs turned back.
 As in the MAPPO paper's repository (arXiv 2103.01955, section 4): exponential averages of x and x**2
 with debiasing, variance floor 1e-2. TorchRL's norms of that name scale prediction and target inside the loss
 instead, which leaves the critic's output in the reward's scale; hence this module.

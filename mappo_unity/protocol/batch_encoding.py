@@ -1,8 +1,7 @@
 """Many equal-looking messages at once: a row of bytes an agent, written column by column with numpy.
 
-In: the fields of a message in order. Out: the bytes of a repeated message field. Numbers get a fixed width
-(varints padded to five bytes, zeros written out), so all rows are alike and no loop runs over agents.
-Knows the wire format, not what the fields mean.
+Numbers get a fixed width (varints padded to five bytes, zeros written out), so all rows are alike and no loop
+runs over agents.
 """
 
 from __future__ import annotations

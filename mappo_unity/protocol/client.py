@@ -1,10 +1,9 @@
 """One running player as a BaseEnv, from the trainer's side.
 
-In: `PlayerOptions` and a seed. Out: DecisionSteps and TerminalSteps. Differs from
-mlagents_envs.environment.UnityEnvironment in that it listens on loopback only, takes a port that the system
-gives, decodes without a loop over numbers, refuses numbers that are not finite, and says what failed and
-where the log is, or what a player without one printed. A failure raises `PlayerFailure`, after which the
-player is gone; `RestartingPlayer` starts another.
+It differs from mlagents_envs.environment.UnityEnvironment in that it listens on loopback only, takes a port
+that the system gives, decodes without a loop over numbers, refuses numbers that are not finite, and says what
+failed and where the log is, or what a player without one printed. A failure raises `PlayerFailure`, after
+which the player is gone; `RestartingPlayer` starts another.
 """
 
 from __future__ import annotations
@@ -109,7 +108,8 @@ class UnityPlayer(BaseEnv):
         self._receive()  # the player's empty message: it waits for the first command
 
     def send_step(self) -> None:
-        """Hand the actions over and let the player go on; agents without an action act with zeros."""
+        """Hand the actions over and let the player play; agents without an action act with zeros."""
+        # as in mlagents_envs, a first step is a reset
         if not self._was_reset:
             return self.send_reset()
 
@@ -136,6 +136,7 @@ class UnityPlayer(BaseEnv):
         """
         output = self._receive()
         try:
+            # first: a behavior is described in the message that brings its first agents
             self._add_behaviors(output)
             infos = output.rl_output.agentInfos
             self._steps = {
@@ -164,7 +165,7 @@ class UnityPlayer(BaseEnv):
         self.receive()
 
     def step(self) -> None:
-        """Go on until some agent reports."""
+        """Advance until some agent reports."""
         self.send_step()
         self.receive()
 

@@ -1,7 +1,6 @@
 """The trainer's end of the messages: bytes to steps of a BaseEnv, actions to bytes.
 
-In: parsed messages (`messages.parse`), ActionTuples. Out: BehaviorSpecs, DecisionSteps, TerminalSteps, and
-the content of UnityInputProto. No loop runs over numbers. Knows nothing of connections or processes.
+No loop runs over numbers.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ class BehaviorDecoder:
         branches = spec.action_spec.discrete_branches
         self._cuts = list(np.cumsum(branches)[:-1])
         self._allowed = bytes(sum(branches))
+        # bytes of each sensor's float32 numbers
         self._widths = [4 * int(np.prod(sensor.shape)) for sensor in spec.observation_specs]
         self._empty = DecisionSteps.empty(spec), TerminalSteps.empty(spec)
 

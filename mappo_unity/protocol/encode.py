@@ -1,8 +1,4 @@
-"""A player's end of the messages: steps of a BaseEnv to bytes, bytes to actions.
-
-In: `BehaviorSpec`s, DecisionSteps, TerminalSteps, an action message. Out: the fields of UnityOutputProto, and
-ActionTuples. Knows nothing of connections or scenes.
-"""
+"""A player's end of the messages: steps of a BaseEnv to bytes, bytes to actions."""
 
 from __future__ import annotations
 
@@ -62,6 +58,7 @@ class BehaviorEncoder:
         """Return the behavior's BrainParametersProto."""
         actions = self.spec.action_spec
         branches = [int(size) for size in actions.discrete_branches]
+        # Tags of single numbers: 0x08 is field 1, 0x10 is field 2; below, 0x30 is 6 and 0x40 is 8.
         spec = b"\x08" + varint(int(actions.continuous_size)) + b"\x10" + varint(len(branches))
         if branches:
             spec += delimited(3, b"".join(varint(size) for size in branches))
@@ -193,6 +190,7 @@ def _head_layout(mask_size: int) -> Layout:
         head.slot(name, width)
 
     if mask_size:
+        # Packed flags, as a length-delimited field 11.
         head.constant(b"\x5a" + varint(mask_size))
         head.slot("mask", mask_size)
 
@@ -205,6 +203,7 @@ def _description(sensor: ObservationSpec) -> bytes:
     return (
         delimited(1, b"".join(varint(int(size)) for size in sensor.shape))
         + delimited(6, b"".join(varint(flag) for flag in flags))
+        # the type of observation, field 7
         + b"\x38"
         + varint(int(sensor.observation_type.value))
         + delimited(8, (sensor.name or "").encode())
@@ -223,6 +222,7 @@ def _float_sensor(index: int, sensor: ObservationSpec) -> Layout:
 
 def _drawn(index: int, sensor: ObservationSpec, obs: np.ndarray) -> list[bytes] | None:
     """Return the ObservationProto fields with PNGs; None where PNG would lose something."""
+    # A PNG holds 256 levels: it is exact only for numbers that are such levels.
     levels = np.rint(obs * 255)
     exact = levels.astype(np.float32) / np.float32(255)
     if not (np.array_equal(exact, obs) and levels.min() >= 0 and levels.max() <= 255):

@@ -1,8 +1,8 @@
 """Messages of the ML-Agents protocol as classes whose number arrays are plain bytes.
 
-In: bytes from a peer. Out: message objects, and small helpers that write the same format. A packed array of
-floats or bools and a bytes field look alike on the wire, so the classes here declare such arrays as bytes:
-parsing touches no single number, and numpy reads them in place. All other fields are those of mlagents_envs.
+A packed array of floats or bools and a bytes field look alike on the wire, so the classes here declare such
+arrays as bytes: parsing touches no single number, and numpy reads them in place. All other fields are those
+of mlagents_envs. Small helpers write the same format.
 
 Wire format: https://protobuf.dev/programming-guides/encoding/
 """

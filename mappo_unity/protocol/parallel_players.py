@@ -1,7 +1,7 @@
 """Several players as one BaseEnv: their agents side by side in every result.
 
-In: players. Out: their steps joined. Actions go to all players before the first result is waited for, so they
-run at the same time. Agent n of player p of P is agent n * P + p outward; groups likewise, and 0 stays 0.
+Actions go to all players before the first result is waited for, so they run at the same time. Agent n of
+player p of P is agent n * P + p outward; groups likewise, and 0 stays 0.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class SeveralPlayers(BaseEnv):
         self._receive()
 
     def step(self) -> None:
-        """Let every player go on until some agent of its reports."""
+        """Let every player advance until some agent of its reports."""
         for player in self.players:
             player.send_step()
         self._receive()
@@ -67,6 +67,7 @@ class SeveralPlayers(BaseEnv):
 
     def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
         """Set the actions of all agents in the last decision steps, in their order."""
+        # The rows stand player by player, as `get_steps` joined them.
         start = 0
         for p in self._holders(behavior_name):
             count = len(self.players[p].get_steps(behavior_name)[0])
@@ -107,6 +108,7 @@ class SeveralPlayers(BaseEnv):
         return ids * len(self.players) + player
 
     def _groups(self, ids: np.ndarray, player: int) -> np.ndarray:
+        # Groups are numbered from 1, agents from 0; group 0 holds those without a group.
         return np.where(ids > 0, (ids - 1) * len(self.players) + player + 1, 0).astype(np.int32)
 
     def _decisions(self, parts: list[tuple[int, DecisionSteps]]) -> DecisionSteps:

@@ -1,7 +1,6 @@
 """Ports of the loopback address: whether one can be listened on.
 
-In: a port. Out: its state, or a `ConfigError` in the user's words. To be asked before gRPC, which prints a
-line of its own where a port is taken.
+This is found out before gRPC tries, which prints a line of its own where a port is taken.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """Players as processes: find the executable, start it, end it, and leave none behind.
 
-In: `file_name` as ML-Agents takes it, arguments. Out: a `PlayerProcess`. Knows nothing of the protocol.
-
 A player must not outlive its trainer, however that ends. On Linux the kernel kills it with the thread that
 started it (prctl PR_SET_PDEATHSIG), so one thread that lives as long as the process starts them all; on other
 systems a player leaves when its connection breaks.
@@ -182,6 +180,7 @@ class PlayerProcess:
     def kill(self) -> None:
         """End it at once, with every process that it started."""
         try:
+            # a player leads its own session, so its group is all that it started
             if hasattr(os, "killpg"):
                 os.killpg(self.pid, signal.SIGKILL)
             else:

@@ -1,9 +1,9 @@
 """Let mlagents_envs run on a current, compiled protobuf.
 
-In: the installed mlagents_envs, whose generated ``*_pb2.py`` files predate protobuf 4 and fail to import
-beside a current one ("Descriptors cannot be created directly"). Out: after `install`, the same modules load:
-each old file still holds the serialized description of its messages, which is read as a literal (the file is
-never executed) and handed to the protobuf runtime. Knows nothing of environments.
+Its generated ``*_pb2.py`` files predate protobuf 4 and fail to import beside a current one ("Descriptors
+cannot be created directly"). After `install` the same modules load: each old file still holds the serialized
+description of its messages, which is read as a literal (the file is never executed) and handed to the
+protobuf runtime.
 """
 
 from __future__ import annotations

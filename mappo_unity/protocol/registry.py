@@ -1,7 +1,6 @@
 """Players that a registry of ML-Agents names: find the entry, fetch its archive, unpack it once.
 
-In: a registry's YAML (path, URL or default) and an entry's name. Out: the executable. Format of a registry:
-mlagents_envs.registry.
+The format of a registry is that of mlagents_envs.registry.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A player that is started again when it fails, as one BaseEnv.
 
-In: a function that starts a player. Out: steps without a gap: when a player fails, a new one takes its place,
-and the result holds a terminal step (interrupted, reward 0, last observation) for every agent whose episode
-was cut off, beside the new player's first decisions. Knows nothing of what is learned from them.
+There is no gap in its steps: when a player fails, a new one takes its place, and the result holds a terminal
+step (interrupted, reward 0, last observation) for every agent whose episode was cut off, beside the new
+player's first decisions.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class RestartingPlayer(BaseEnv):
         self.receive()
 
     def step(self) -> None:
-        """Go on until some agent reports."""
+        """Advance until some agent reports."""
         self.send_step()
         self.receive()
 
@@ -147,6 +147,7 @@ class RestartingPlayer(BaseEnv):
 
         for name in specs:
             decision, terminal = self.player.get_steps(name)
+            # by agent: not every agent is in every result
             playing = self._last.setdefault(name, {})
 
             # The ended ones first: an id that is in both plays on.
@@ -188,6 +189,7 @@ class RestartingPlayer(BaseEnv):
                 failure = error
                 continue
 
+            # Known only now: behaviors show up with the first result.
             return self._check_same(self.player.behavior_specs)
 
     def _check_same(self, specs: BehaviorMapping) -> None:

@@ -1,8 +1,8 @@
 """Serve a scene as if it were a built Unity player.
 
-In: a scene's name (or package.module:function) and the arguments that ML-Agents passes to players. Out: the
-gRPC client's side of the ML-Agents protocol (API 1.5.0) on a port of this machine, until the trainer closes
-or goes away. Order of messages: RpcCommunicator.cs of com.unity.ml-agents. Must not import torch.
+It is the gRPC client's side of the ML-Agents protocol (API 1.5.0) on a port of this machine, until the
+trainer closes or goes away. The order of messages is that of RpcCommunicator.cs of com.unity.ml-agents. A
+player must not import torch.
 """
 
 from __future__ import annotations

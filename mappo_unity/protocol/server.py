@@ -1,7 +1,6 @@
 """The trainer's end of the connection: a gRPC server on the loopback address that one player calls.
 
-In: answers as bytes. Out: the player's requests as bytes, with time-outs. Other addresses of the machine are
-not listened on. Knows nothing of what the bytes mean.
+Other addresses of the machine are not listened on.
 """
 
 from __future__ import annotations
@@ -95,6 +94,7 @@ class Link:
 
     def _exchange(self, request: bytes, context: Any) -> bytes:
         """Run in a thread of gRPC: hand a request over and wait for its answer."""
+        # who calls first is the player
         peer = context.peer()
         if self._peer is None:
             self._peer = peer

@@ -1,7 +1,6 @@
 """Side channels as a player reads them: environment parameters and engine settings.
 
-In: the `side_channel` bytes of an UnityRLInputProto. Out: plain values. Layout of the messages: the outgoing
-side in mlagents_envs.side_channel.
+The layout of the messages is that of the outgoing side in mlagents_envs.side_channel.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Take the episodes of crashed players out of a batch.
 
-In: a batch as collected, what `UnityEnv.pop_crashed_episodes` says. Out: the batch, in which those episodes'
-decisions are nobody's: they are not learned from and do not count. Knows nothing of players.
+Their decisions become nobody's: they are not learned from and do not count.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Finished episodes and batches to scalars.
-
-In: episodes as `UnityEnv.pop_episodes` returns them, batches. Out: dicts of floats. Logs nothing.
-"""
+"""Figures about finished episodes and collected batches, as dicts of floats."""
 
 from __future__ import annotations
 
@@ -28,6 +25,7 @@ class RecentEpisodes:
         count = 0
         for behavior, finished in episodes.items():
             for episode in finished:
+                # an episode without a decision says nothing about the policy
                 if episode.length:
                     row = (episode.individual_return, episode.group_return, episode.length)
                     self.recent[behavior].append(row)
@@ -60,14 +58,14 @@ class RecentEpisodes:
         return out
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that continuing needs."""
+        """Return everything that resuming needs."""
         return {
             "total": self.total,
             "recent": {b: [list(r) for r in rows] for b, rows in self.recent.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
+        """Resume from what `state_dict` returned."""
         self.total = int(state["total"])
         for behavior, rows in state["recent"].items():
             self.recent[behavior] = deque(((r[0], r[1], int(r[2])) for r in rows), maxlen=self.size)

@@ -1,7 +1,7 @@
-"""From override lines to a training run: a new one in a folder of its own, or one that is resumed.
+"""How a command line becomes a training run: a new one in a folder of its own, or one that is resumed.
 
-In: the lines of a command line. Out: `Launched`. Everything that options alone can tell is checked before
-torch is loaded; a run that is refused leaves nothing behind. Prints nothing.
+Everything that options alone can tell is checked before torch is loaded; a run that is refused leaves nothing
+behind.
 """
 
 from __future__ import annotations
@@ -108,6 +108,7 @@ def _resume(lines: list[str], path: Path, warn: Warn, show: _Show) -> Launched:
             message = f"nothing to train, and nothing was changed: the run in {folder} is over: {over}"
             return Launched(folder, None, message)
 
+        # the record says how the run was trained: a resume that wrote no checkpoint puts the old one back
         record = runs.read_record(folder)
         runs.write_record(folder, config, lines)
         try:

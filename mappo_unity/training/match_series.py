@@ -1,7 +1,4 @@
-"""Series of matches against a random side while a policy learns: when they are played, what they said.
-
-In: the run's options, the actors. Out: figures for the metrics, a score. Knows no learner.
-"""
+"""Series of matches against a random side while a policy learns: when they are played, what they said."""
 
 from __future__ import annotations
 
@@ -86,10 +83,11 @@ class MatchSeries:
 
     def score(self, agent_steps: int) -> float:
         """Return what a two-sided run's best checkpoint is chosen by; before any series newer is better."""
+        # below any points, which are 0 to 1, and a little higher with every step
         return agent_steps * 1e-12 - 1.0 if self.points is None else self.points
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what continuing needs."""
+        """Return what resuming needs."""
         return {"played_at": self._played_at, "points": self.points}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -1,7 +1,4 @@
-"""How much memory is free, and whether something fits into it.
-
-In: nothing, or a size in bytes. Out: bytes, a size for reading, or a ConfigError. Knows no options.
-"""
+"""How much memory is free, and whether something fits into it."""
 
 from __future__ import annotations
 

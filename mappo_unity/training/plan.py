@@ -1,8 +1,4 @@
-"""The jobs of a sweep, every one checked before the first one starts.
-
-In: overrides with several values, or a search (hydra/sweeper=optuna). Out: `Plan`, or a ConfigError. Runs
-nothing.
-"""
+"""The jobs of a sweep, every one checked before the first one starts."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Whether a checkpoint fits an environment and its options.
-
-In: a checkpoint's entries, a `UnityEnv`, model options. Out: nothing, or an error that says what differs.
-"""
+"""Whether a checkpoint fits an environment and its options."""
 
 from __future__ import annotations
 

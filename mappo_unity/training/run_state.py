@@ -1,7 +1,4 @@
-"""The state of a training run: everything that a checkpoint holds.
-
-In: what is trained (`TrainingSetup`), a checkpoint's entries. Out: counters, metrics, a ``state_dict``.
-"""
+"""The state of a training run: everything that a checkpoint holds."""
 
 from __future__ import annotations
 
@@ -143,7 +140,7 @@ class RunState:
         }
 
     def load(self, path: Path) -> None:
-        """Go on from a checkpoint; `restore_rng` follows when everything is built.
+        """Resume from a checkpoint; `restore_rng` follows when everything is built.
 
         Raises:
             CheckpointError: it belongs to another environment or other networks.
@@ -153,6 +150,7 @@ class RunState:
 
         for name, learner in self.setup.learners.items():
             learner.load_state_dict(state["learners"][name])
+        # an environment that gives no snapshots begins new episodes
         if state["env"] is not None:
             self._restore_env(path, checkpoint.to_arrays(state["env"]))
 
@@ -161,6 +159,7 @@ class RunState:
         for name in _COUNTERS:
             setattr(self, name, state[name])
 
+        # checkpoints of older versions hold no samples
         self.samples = state.get("samples", {})
         self._rng_state = state["rng"]
 

@@ -1,7 +1,4 @@
-"""When checkpoints are written: regularly, when the policy is the best so far, and when anything breaks in.
-
-In: the run's state after each complete iteration. Out: files; a line where an error ended the run.
-"""
+"""When checkpoints are written: regularly, when the policy is the best so far, and when a run breaks off."""
 
 from __future__ import annotations
 
@@ -82,6 +79,7 @@ class CheckpointSaver:
             state.best_score = score
         if self.last is not None:  # the first one comes early and is not part of the rhythm
             state.saved_at = complete["agent_steps"]
+        # both are known only now, and a resumed run needs them
         complete |= {"best_score": state.best_score, "saved_at": state.saved_at}
 
         steps, keep = complete["agent_steps"], self._cfg.keep_checkpoints

@@ -1,7 +1,7 @@
 """What a training run is made of: the environment, the learners and the collector.
 
-In: `Config`, a run folder. Out: `TrainingSetup`. What an environment has (sensors, actions, teams) is read
-from it; what does not fit into memory is refused before the first step.
+What an environment has (sensors, actions, teams) is read from it; what does not fit into memory is refused
+before the first step.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ class TrainingSetup:
         try:
             yield iter(collector)
         finally:
+            # `set_up` opened the environment, and closes it
             collector.shutdown(close_env=False)
 
     def learn(self, batch: TensorDictBase, progress: float) -> dict[str, dict[str, float]]:
@@ -133,6 +134,7 @@ def batch_rounds(cfg: CollectConfig, env: UnityEnv) -> int:
     """Return the rounds of a batch, for the agents that the environment began with."""
     if cfg.rounds is not None:
         return cfg.rounds
+    # agents that are there, not slots: some of these may stay empty
     agents = sum(int(behavior.present.sum()) for behavior in env.behaviors.values())
     return -(-cfg.batch_size // max(1, agents))
 

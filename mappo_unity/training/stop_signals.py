@@ -1,6 +1,6 @@
 """How SIGINT and SIGTERM end a training run: after its iteration, or, where that takes long, at once.
 
-In: signals. Out: `signal`, which the loop looks at between iterations, or `Interrupted` in the middle of one.
+The loop looks at `StopSignals.signal` between iterations; in the middle of one `Interrupted` is raised.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Sweeps: many runs from one command line, through Hydra's sweepers and launchers.
 
-In: overrides with several values, or a search (hydra/sweeper=optuna). Out: a folder with one run
-folder a job, each with its result.json. A job that fails leaves the others alone.
+A sweep's folder holds a run folder for each job, with its result.json. A job that fails leaves the others
+alone.
 """
 
 from __future__ import annotations
@@ -117,6 +117,7 @@ def run_job(tree: DictConfig) -> float | None:
     """
     with job_signals() as may_begin:
         return _run_job(tree) if may_begin else None
+    # reached where `job_signals` kept an Interrupted to itself
     return None
 
 

@@ -1,8 +1,7 @@
 """How signals end a sweep: at once where jobs run one by one, with a wait where they run side by side.
 
-In: SIGINT and SIGTERM. Out: `Interrupted`, or the number of the signal once the jobs have written their
-checkpoints. A launcher of processes kills them when its own one is interrupted; so that one does not take the
-first signal as its own, but hands it on, and waits. Knows nothing of training.
+A launcher of processes kills its jobs when its own process is interrupted; so that process does not take the
+first signal as its own, but hands it on, and waits until the jobs have written their checkpoints.
 """
 
 from __future__ import annotations
@@ -104,6 +103,7 @@ class _JobProcess:
         self._installed = False
 
     def begin(self) -> None:
+        # Python lets only the main thread install handlers
         if not self._installed and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, self)
             signal.signal(signal.SIGTERM, self)

@@ -1,7 +1,7 @@
 """The training loop: the file to read first.
 
-In: a checked `Config`, a run folder. Out: checkpoints, metrics, an `Outcome`. `train` is the loop: collect,
-learn, count, play matches, log, save. What is trained comes from `setup`, what is counted is in `run_state`.
+`train` is the loop: collect, learn, count, play matches, log, save. What is trained comes from `setup`, what
+is counted is in `run_state`.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ def train(
                 except BaseException as error:
                     with stop.ignored():
                         saver.rescue(log.message_if_possible)
+                    # with a checkpoint an interrupted run can be resumed: it has an outcome like any other
                     if not isinstance(error, Interrupted) or saver.last is None:
                         raise
                     status = INTERRUPTED
@@ -125,12 +126,13 @@ def _iterate(
         saver.save_if_due(won=bool(series) and state.score() >= state.best_score)
         status = (after_iteration(state) if after_iteration else None) or _status(cfg, state, stop)
 
+    # the loop is over: the timer of a first signal must not break off the last checkpoint
     stop.end_patience()
     return status
 
 
 def _status(cfg: Config, state: RunState, stop: StopSignals) -> str | None:
-    """Return the status with which the run ends now, or None while it goes on."""
+    """Return the status with which the run ends now, or None while there is more to do."""
     if stop.signal is not None:
         return INTERRUPTED
     if state.agent_steps >= cfg.max_steps:
