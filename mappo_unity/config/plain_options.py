@@ -1,7 +1,7 @@
 """Mistakes in the form of option=value, for the commands without presets.
 
-Those are mappo-eval, mappo-play and mappo-export. Switches, words alone, an option given twice: the message says how it
-is written.
+Those are mappo-eval, mappo-play and mappo-export. Switches, words alone and options given twice are told with
+how they are written.
 """
 
 from __future__ import annotations

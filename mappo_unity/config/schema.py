@@ -219,7 +219,7 @@ class ModelConfig:
     """Logarithm of the initial standard deviation of continuous actions (before the division by 3)."""
 
     def __post_init__(self) -> None:
-        # [1] stands for null, which means model.hidden and needs no check of its own
+        # null and [] mean model.hidden, which is checked itself
         for option, widths in (
             ("model.hidden", self.hidden),
             ("model.critic_hidden", self.critic_hidden or [1]),
