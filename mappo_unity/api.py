@@ -1,4 +1,4 @@
-"""The Python door: what the commands do, for scripts and notebooks. Prints nothing unless asked."""
+"""What the commands do, as functions for scripts and notebooks; they print nothing by themselves."""
 
 from __future__ import annotations
 
@@ -48,6 +48,7 @@ def train(
     from mappo_unity.config.text_lines import literal_lines
     from mappo_unity.training.launch import launch
 
+    # as a command line goes: today's names first, then texts as they were typed
     lines = literal_lines(rename_lines(list(options)), Config, False)
     console = Console(quiet=not progress)
     launched = launch(
@@ -74,6 +75,7 @@ def load_policy(where: str | Path, deterministic: bool = True, seed: int = 0) ->
     Raises:
         ConfigError: nothing is there, or nothing that plays.
     """
+    # only now: the package can be imported without loading torch
     import torch
 
     from mappo_unity.policies.evaluate import open_policy

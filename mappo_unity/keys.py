@@ -17,7 +17,7 @@ SENSOR = "obs_{}"  # float32 [..., A, *sensor shape]: sensor i before concatenat
 ACTION = "action"  # see models.ActionLayout
 LOG_PROB = "action_log_prob"  # float32 [..., A]
 MASK = "action_mask"  # bool [..., A, sum of branches]: True = allowed (Unity's sense, turned round)
-ACTING = "acting"  # bool [..., A, 1]: the agent was asked for an action in this round
+ACTING = "acting"  # bool [..., A, 1]: the agent requested a decision in this round
 PRESENT = "present"  # bool [..., A, 1]: an agent holds the slot (or held it and departed)
 DEPARTED = "departed"  # bool [..., A, 1]: the agent ended for good while its team plays on
 REWARD = "reward"  # float32 [..., A, 1]: individual reward that arrived in this round

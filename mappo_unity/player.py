@@ -1,4 +1,4 @@
-"""The old place of mappo-player, which older player folders start as ``-m mappo_unity.player``."""
+"""mappo-player as ``python -m mappo_unity.player``, the form that the scripts of player folders use."""
 
 from mappo_unity.cli import player_main
 

@@ -1,8 +1,8 @@
 """SIGINT and SIGTERM: who takes them during a block, and how they become exceptions.
 
-In: a block, such as one of imports and reading of options. Out: the interrupt, in the block or after it.
 Extension modules (NumPy, torch, MuJoCo) lose an interrupt that arrives while they are loaded, or are left
-half loaded. How a training run and a sweep end is theirs: `training.stop_signals`, `training.sweep_signals`.
+half loaded: during imports it waits, or ends the process at once. How a training run and a sweep end is in
+`training.stop_signals` and `training.sweep_signals`.
 """
 
 from __future__ import annotations
@@ -59,6 +59,7 @@ def interrupts_wait() -> Iterator[None]:
         with handled(lambda number, frame: came.append(number), signal.SIGINT):
             yield
     finally:
+        # late, but as if it came now: to the handler that is back in place
         if came:
             waiting = signal.getsignal(signal.SIGINT)
             if not callable(waiting):

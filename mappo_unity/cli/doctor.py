@@ -1,7 +1,7 @@
 """mappo-doctor: look for what keeps a Unity game from being trained on, and say what cures it.
 
-In: nothing, or a player's file, or the Editor. Out: lines of findings, and an exit code, 0 when nothing
-fails. Imports neither torch nor TorchRL; prints through the function it is given.
+The installation is always examined, a player or the Editor if it is named. The exit code is 0 when nothing
+fails.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ def diagnose(arguments: Sequence[str], say: Say) -> int:
     examine_ports(report, options.port)
 
     if options.file_name is not None or options.editor:
+        # only now: most of what it says needs no player, and comes at once
         from mappo_unity.cli.doctor_player import examine_player
 
         report.head("Editor" if options.editor else "player")

@@ -1,7 +1,4 @@
-"""What mappo-doctor learns from a player or the Editor: does it start, connect, ask for decisions, how fast.
-
-In: the command's options. Out: findings. Imports neither torch nor TorchRL.
-"""
+"""What mappo-doctor learns from a player or the Editor: its handshake, behaviors, rhythm and speed."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.protocol.ports import check_port
 
 TIME_SCALES = (1.0, 20.0, 100.0)
-PATIENCE_STEPS = 200  # environment steps within which some agent should ask
+PATIENCE_STEPS = 200  # environment steps within which some agent should request a decision
 
 
 def examine_player(report: Report, options: argparse.Namespace) -> None:
@@ -61,6 +58,7 @@ def _examine_running(
         engine={"time_scale": 20.0},
     )
 
+    # in this order: each part needs what the one before it has shown to work
     player = UnityPlayer(settings)
     try:
         _examine_handshake(report, player)
@@ -123,7 +121,7 @@ def _examine_handshake(report: Report, player: Any) -> None:
 def _examine_behaviors(report: Report, player: Any) -> bool:
     player.reset()
 
-    # behaviors show up with their first agent, which may ask some steps after the reset
+    # behaviors show up with their first agent, which may request a decision some steps after the reset
     for _ in range(PATIENCE_STEPS):
         if any(len(player.get_steps(name)[0]) for name in player.behavior_specs):
             break

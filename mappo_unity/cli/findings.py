@@ -1,7 +1,4 @@
-"""What mappo-doctor says: findings, good and bad, and what cures the bad ones.
-
-In: texts. Out: the same through a function, and counts.
-"""
+"""What mappo-doctor says: findings, good and bad, and what cures the bad ones."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """The text of --help, from the tables of options and choices.
 
-In: a dataclass of options, the files under conf/. Out: text. Imports neither torch nor Hydra, so
-that help comes at once.
+Neither torch nor Hydra is imported, so that help comes at once.
 """
 
 from __future__ import annotations
@@ -94,6 +93,7 @@ def option_text(schema: type) -> str:
     table = option_table(schema)
     lines = ["Options (name: type = default):"]
 
+    # what stands in no section comes first
     sections = [option for option in table.values() if option.is_section]
     lines += [
         _option_text(option) for key, option in table.items() if "." not in key and option not in sections

@@ -1,7 +1,6 @@
 """mappo-player build: an executable that looks to ML-Agents like a built Unity player.
 
-In: a scene and a folder. Out: ``FOLDER/SCENE.x86_64`` (macOS: ``SCENE.app``), a script that starts
-mappo-player with this Python. Knows nothing of the protocol.
+``FOLDER/SCENE.x86_64`` (macOS: ``SCENE.app``) is a script that starts mappo-player with this Python.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
     name = scene.rpartition(":")[2] or scene
     path = _executable(Path(folder), name)
 
+    # the trainer's own arguments, its port among them, come behind these ("$@")
     command = [sys.executable, "-m", "mappo_unity.player", scene]
     if options.num_areas is not None:
         command += ["--num-areas", str(options.num_areas)]
@@ -34,6 +34,7 @@ def build(scene: str, folder: str, rest: list[str], options: Namespace) -> Path:
     if options.no_png:
         command += ["--no-png"]
 
+    # the error of mkdir would not say which part of the path is a file
     file = next((above for above in path.parents if above.exists() and not above.is_dir()), None)
     if file is not None:
         raise ConfigError(f"{path} cannot be written: {file} is a file, not a folder")

@@ -1,7 +1,7 @@
 """The log of mappo-player: lines with the time of day, in a file or on standard output.
 
-In: a path and lines. Out: the lines. A log that fails at its first line is a mistake in the options; later (a
-disk that filled up) the trainer's work is worth more than the log, and lines are lost.
+A log that fails at its first line is a mistake in the options; later (a disk that filled up) the trainer's
+work is worth more than the log, and lines are lost.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The command line of mappo-player: its own switches among the arguments that Unity players take.
-
-In: arguments. Out: values and what has no effect, or a `ConfigError`.
-"""
+"""The command line of mappo-player: its own switches among the arguments that Unity players take."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""Tables and summaries for people, and their machine-readable twins.
+"""Tables and summaries of runs, sweeps and evaluations for people, and their machine-readable twins.
 
-In: results of runs, sweeps and evaluations. Out: rich renderables and text; only the command line
-prints them.
+Nothing is printed here: the commands print what these functions return.
 """
 
 from __future__ import annotations

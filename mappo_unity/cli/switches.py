@@ -1,6 +1,6 @@
-"""The command lines that take switches (mappo-player, mappo-doctor): argparse that speaks as we do.
+"""Command lines with switches (mappo-player, mappo-doctor): argparse with our errors.
 
-In: arguments. Out: their values, or a `ConfigError` of one line that names the near switch.
+A mistake is a `ConfigError` of one line, which names the switch that is most like the one given.
 """
 
 from __future__ import annotations

@@ -59,6 +59,7 @@ def _train(lines: list[str], file: Path | None) -> int:
         f"resume with: mappo-train {shell_argument('resume', folder)}",
         file=sys.stderr,
     )
+    # as shells report a process that a signal ended
     return 128 + outcome.signal
 
 

@@ -1,7 +1,4 @@
-"""Which options of the environment have an effect with which backend.
-
-In: the options that were given, the configurations they led to. Out: nothing, or a `ConfigError`.
-"""
+"""Which options of the environment have an effect with which backend."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""Override lines as people type them -> lines that Hydra's grammar reads; and back, for tables.
+"""Override lines as people type them, turned into lines that Hydra's grammar reads; and back, for tables.
 
-In: override lines. Out: the same, with ``recipe=none`` for ``recipe=null``, with quotes around foreign
-letters, and with one dictionary, ``behaviors={3DBall: {ppo: {lr: 1e-4}}}``, for names of behaviors and
-parameters that the grammar does not take as keys (``behaviors.3DBall.ppo.lr=1e-4``). Hydra merges it with
-what is there.
+``recipe=null`` becomes ``recipe=none``, and foreign letters get quotes. Names of behaviors and parameters
+that the grammar does not take as keys (``behaviors.3DBall.ppo.lr=1e-4``) become one dictionary,
+``behaviors={3DBall: {ppo: {lr: 1e-4}}}``, which Hydra merges with what is there.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Command-line overrides -> a checked `Config`.
+"""From command-line overrides to a checked `Config`.
 
-In: overrides, the files under conf/ and, when a run goes on, its config.yaml. Out: `Composed`.
-Every mistake is a ConfigError. Nothing is created here, and torch is not imported.
+Below the overrides are the presets and a file of options, or a resumed run's config.yaml. Every mistake is
+a ConfigError. No folder is made, and torch is not imported.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Composed:
 def compose_config(lines: list[str], base: Path | None = None, file: Path | None = None) -> Composed:
     """Compose and check the options of one run.
 
-    `base` is the config.yaml of a run that goes on; without it the presets are the base, and the options of
-    `file` go on top of them. Raises ConfigError.
+    `base` is the config.yaml of a run that is resumed; without it the presets are the base, and the options
+    of `file` go on top of them. Raises ConfigError.
     """
     # our checks come before Hydra's: they name the rule and the choices
     check_overrides(lines, Config, group_choices())
@@ -123,6 +123,7 @@ def load_config(path: Path) -> Config:
     try:
         return compose_config([], path).config
     except ConfigError as error:
+        # some messages name the file already
         if str(error).startswith(str(path)):
             raise
         raise ConfigError(f"{path}: {error}") from error
@@ -130,6 +131,7 @@ def load_config(path: Path) -> Config:
 
 def to_config(tree: DictConfig) -> Config:
     """Turn a composed tree into the dataclass and run its checks; raise ConfigError."""
+    # Hydra's own node is no part of `Config`
     tree = tree.copy()
     with open_dict(tree):
         tree.pop("hydra", None)
@@ -181,7 +183,7 @@ def _resumed_root(base: Path) -> dict[Any, Any]:
         if group != "env"
     ]
 
-    # the recipe's own for the env
+    # the file that the recipe has for this env, if it has one
     official = {"optional official": f"${{recipe}}/{saved['env'].get('name')}"}
     quiet = [{"override hydra/job_logging": "none"}, {"override hydra/hydra_logging": "none"}]
 

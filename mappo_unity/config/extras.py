@@ -1,7 +1,4 @@
-"""How an extra of this package is installed here, for messages that miss one.
-
-In: the extra's name. Out: the command to type. Imports nothing of it.
-"""
+"""How an extra of this package is installed here, for messages that miss one."""
 
 from __future__ import annotations
 
@@ -16,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def install_command(extra: str) -> str:
     """Return what installs an extra: scripts/setup for a clone's own .venv, pip elsewhere."""
+    # short where the user stands at the top of the clone, else with the whole path
     is_here = Path.cwd() == ROOT
     setup = ROOT / "scripts" / "setup"
 

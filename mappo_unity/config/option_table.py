@@ -1,7 +1,6 @@
-"""The options of a command as a table, read from its dataclass.
+"""The options of a command as a table: one `Option` for each field of its dataclass.
 
-In: a dataclass of mappo_unity.config.schema. Out: one `Option` a field, with type, default and the
-docstring below the field. Reads the source of the dataclass, imports nothing heavy.
+The description of an option is the docstring below its field, which is read from the source.
 """
 
 from __future__ import annotations
@@ -176,6 +175,7 @@ def _members(enum: type[Enum]) -> str:
 
 @cache
 def _module_docs(module: str) -> dict[str, dict[str, str]]:
+    # Python keeps no docstrings of fields: they stand only in the source
     tree = ast.parse(inspect.getsource(sys.modules[module]))
     return {node.name: _class_docs(node) for node in tree.body if isinstance(node, ast.ClassDef)}
 

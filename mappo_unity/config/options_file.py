@@ -1,7 +1,7 @@
 """Options from a file: ``mappo-train --config my.yaml ppo.lr=1e-4``.
 
-In: command lines, a YAML file such as a run's config.yaml or a part of one. Out: the root of the options, in
-which the file wins over the presets, and the command line over the file. Composes nothing.
+The file is YAML such as a run's config.yaml, or a part of one. It wins over the presets, and the command line
+wins over the file.
 """
 
 from __future__ import annotations
@@ -96,8 +96,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
         raise ConfigError(f"{path}: resume belongs on the command line, mappo-train resume=RUN")
 
     try:
+        # a group's name with a text chooses a preset, with a section it sets options
         choices = {group: _choice(group, saved.pop(group)) for group in _CHOICES if _is_name(saved, group)}
 
+        # keys may be nested or dotted (ppo.lr): both end up nested
         tree = OmegaConf.create({})
         for key, value in saved.items():
             check_value(str(key), value, Config)

@@ -1,8 +1,4 @@
-"""Hydra's override grammar and the checks of single overrides.
-
-In: lines such as ``ppo.lr=1e-4`` and the table of options. Out: parsed overrides, or a ConfigError
-that names the option, its value, the rule and the choices. Composes nothing.
-"""
+"""Hydra's override grammar, and the checks of single overrides such as ``ppo.lr=1e-4``."""
 
 from __future__ import annotations
 
@@ -92,6 +88,7 @@ def check_overrides(
                 f"(mappo-train -m {shell_word(line)})"
             )
 
+        # Hydra's own options are not in our table: only a few rules of theirs are checked
         if key.startswith(("hydra.", "hydra/")) and groups:
             _check_hydra(override, line)
             continue
@@ -112,6 +109,7 @@ def range_length(override: Override) -> int:
             f"{value.step})"
         )
 
+    # stop is not one of the values, as in Python's range
     return max(0, math.ceil((value.stop - value.start) / value.step))
 
 
@@ -128,6 +126,7 @@ def check_value(key: str, value: Any, schema: type) -> None:
             raise ConfigError(f"{key}={show_value(value)}: {key} is a section; its options: {inside}")
         for name, item in value.items():
             check_value(f"{key}.{name}", item, schema)
+    # an interpolation has no value before it is composed
     elif not (isinstance(value, str) and "${" in value):
         _check_type(key, value, option, schema)
 
@@ -288,6 +287,7 @@ def _values(override: Override) -> Iterator[Any]:
         yield value.start
         yield value.end
     elif isinstance(value, RangeSweep):
+        # a long range is not walked through: its ends have the type and the size of all
         number = range_length(override)
         if number:
             first: Any = value.start

@@ -1,7 +1,4 @@
-"""Packages that are imported where they are needed, and what to say where one is missing.
-
-In: a package's name. Out: the package, or an `ExportError` that names the extra.
-"""
+"""Packages that are imported where they are needed, and what to say where one is missing."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Options of one behavior name: the sections ppo and model, with its own overrides on top.
-
-In: `Config`, a policy name. Out: its `ModelConfig` and `PPOConfig`, checked like the others.
-"""
+"""Options of one behavior name: the sections ppo and model, with its own overrides on top."""
 
 from __future__ import annotations
 
@@ -44,6 +41,7 @@ def behavior_config(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
     own = cfg.behaviors.get(policy) or {}
     where = f"behaviors.{policy}"
 
+    # the schema has no fields below a behavior's name, so nothing has checked their form yet
     if not isinstance(own, dict):
         raise ConfigError(f"{where}={own!r} must hold sections, for example {where}.ppo.lr=1e-4")
 

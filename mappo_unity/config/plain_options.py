@@ -1,7 +1,7 @@
-"""What people write who do not know option=value yet: switches, words alone, an option twice.
+"""Mistakes in the form of option=value, for the commands without presets.
 
-In: the arguments of a command without presets (mappo-eval, mappo-play, mappo-export) and its dataclass. Out:
-nothing, or a `ConfigError` that says how it is written.
+Those are mappo-eval, mappo-play and mappo-export. Switches, words alone and options given twice are told with
+how they are written.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Checks of numbers on the command lines that take plain options (mappo-player, mappo-doctor).
-
-In: an option's name and value. Out: nothing, or a `ConfigError`.
-"""
+"""Checks of numbers on the command lines that take switches (mappo-player, mappo-doctor)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Every option, as one dataclass field with its type, default and description.
 
-In: nothing. Out: `Config` and its sections, checked when they are built from a composed
-configuration. This module must stay importable without torch, so that ``--help`` and errors
-about options come at once.
+Values are checked when `Config` and its sections are built. This module must stay importable without torch,
+so that ``--help`` and errors about options come at once.
 """
 
 from __future__ import annotations
@@ -140,7 +139,7 @@ class EnvConfig:
     max_teams: Optional[int] = None
     """Team slots of a behavior; null: as many as are seen at the start."""
     note: Optional[str] = None
-    """Said when a training begins: what the environment needs and the trainer does not have."""
+    """Said when a training run begins: what the environment needs and the trainer does not have."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w.-]*\w[\w.-]*", self.name):
@@ -220,6 +219,7 @@ class ModelConfig:
     """Logarithm of the initial standard deviation of continuous actions (before the division by 3)."""
 
     def __post_init__(self) -> None:
+        # null and [] mean model.hidden, which is checked itself
         for option, widths in (
             ("model.hidden", self.hidden),
             ("model.critic_hidden", self.critic_hidden or [1]),
@@ -402,7 +402,7 @@ class Config:
     update_threads: int = 1
     """Threads of torch while learning, at most one a core; large minibatches gain where a core is idle."""
     resume: Optional[str] = None
-    """Run folder or checkpoint file to continue, in the same folder."""
+    """Run folder or checkpoint file to resume, in the same folder."""
     stop_at_return: Optional[float] = None
     """End the run when return_mean over a full window reaches this."""
     max_jobs: int = 1000

@@ -1,7 +1,7 @@
 """Texts as people type them: ``run=/x/jürgen/a, b`` needs no quotes inside quotes.
 
-In: override lines. Out: the same with quotes where Hydra's grammar cannot read a text, or takes it for
-something else (a number, a list, several values); names that it cannot read, spelt in letters that it can.
+Quotes are put where Hydra's grammar cannot read a text, or takes it for something else (a number, a list,
+several values). Names that it cannot read are spelt in letters that it can.
 """
 
 from __future__ import annotations
@@ -95,6 +95,7 @@ def parse_or_none(line: str) -> Override | None:
 def _text_options(schema: type) -> frozenset[str]:
     table = option_table(schema)
     texts = {key for key, option in table.items() if without_none(option.type) is str}
+    # only mappo-train has resume and, with it, the options of Hydra
     return frozenset(texts | {key for key in ONE_FOLDER if key.startswith("hydra.") and "resume" in table})
 
 

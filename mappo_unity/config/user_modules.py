@@ -1,7 +1,7 @@
 """Where the module of env.factory lies: beside the user, on Python's path, or where a run found it.
 
-In: package.module:function, a folder that a run remembers. Out: folders, and `sys.path` with what is needed
-added. Imports no more than parent packages.
+The module itself is not imported, but looking for it imports its parent packages. `sys.path` gets the folders
+that are needed.
 """
 
 from __future__ import annotations

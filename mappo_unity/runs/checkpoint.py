@@ -1,7 +1,7 @@
 """Checkpoints: written whole or not at all, read without running code.
 
-In: nested dicts of tensors, numpy arrays and plain values. Out: ``.pt`` files that plain
-``torch.load(weights_only=True)`` opens. Knows nothing of what the entries mean.
+A checkpoint is a nested dict of tensors, numpy arrays and plain values, in a ``.pt`` file that plain
+``torch.load(weights_only=True)`` opens.
 
 A file is written beside its place, synced and renamed, so that a kill or a full disk leaves the
 previous one. It is a zip archive; its checksums are verified before anything is read, and only
@@ -87,7 +87,8 @@ def load(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: it is missing, damaged, not ours, or holds more than tensors and plain values.
     """
-    read_plain(path)  # says what is wrong with it
+    # Called for its checks: it says what is wrong with the file.
+    read_plain(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged or hostile files

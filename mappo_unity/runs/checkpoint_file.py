@@ -1,8 +1,7 @@
 """What can be known of checkpoints without torch: which there are, whether one is whole, and what it holds.
 
-In: a run folder or a file. Out: paths, plain values, or a `CheckpointError`. A checkpoint is a zip archive:
-its checksums are verified first, then its pickle is read with a stand-in for everything but plain values, so
-nothing in it is ever run and no tensor is loaded.
+A checkpoint is a zip archive: its checksums are verified first, then its pickle is read with a stand-in for
+everything but plain values, so nothing in it is ever run and no tensor is loaded.
 """
 
 from __future__ import annotations
@@ -43,6 +42,7 @@ def read_plain(path: Path) -> dict[str, Any]:
 
     try:
         with zipfile.ZipFile(path) as archive:
+            # Checksums first: nothing of a damaged archive reaches the unpickler.
             damaged = archive.testzip()
             if damaged is not None:
                 raise CheckpointError(

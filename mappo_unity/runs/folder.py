@@ -1,7 +1,6 @@
 """Run folders: made without collisions, and the record of how a run came about.
 
-In: paths, a `Config`, override lines. Out: a folder with config.yaml (every option), overrides.yaml
-(the command lines with their dates) and versions.json. Knows nothing of training.
+The record: config.yaml (every option), overrides.yaml (the command lines with their dates), versions.json.
 """
 
 from __future__ import annotations
@@ -98,6 +97,8 @@ def write_record(folder: Path, config: Config, lines: list[str]) -> None:
     lasting = replace(config, resume=None)
     history = _history(folder / OVERRIDES)
     versions = read_versions()
+
+    # Resuming may start in another folder, where the module would not be found.
     if config.env.factory is not None:
         versions[FACTORY_FOLDER] = str(folder_of(config.env.factory) or "") or None
     history.append({"date": datetime.now().astimezone().isoformat(timespec="seconds"), "overrides": lines})

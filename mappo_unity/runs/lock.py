@@ -1,7 +1,7 @@
-"""One training at a time in a run folder.
+"""One training run at a time in a run folder, by a lock.
 
-In: a run folder. Out: a lock that the operating system holds for this process, and takes back however the
-process ends: none is ever left over. Those who only read a run (evaluation, export, videos) take none.
+The operating system holds the lock for this process, and takes it back however the process ends: none is ever
+left over. Those who only read a run (evaluation, export, videos) take none.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Metrics out of a run: ``metrics.csv`` always, TorchRL's loggers by choice, progress on the terminal.
 
-In: one row of numbers an iteration, and the run's folder. Out: files there, services, a progress line.
-A resumed run continues its files without repeated rows. Knows nothing of how the numbers came about.
+It takes one row of numbers an iteration. A resumed run appends to its files, without repeated rows.
 """
 
 from __future__ import annotations
@@ -47,10 +46,10 @@ def check_loggers(cfg: LogConfig) -> None:
 class RunLog:
     """Take a run's metrics, one row an iteration; also a context manager that closes itself.
 
-    `folder` is the run's. With `resume_steps` given (agent decisions at the checkpoint that is continued)
+    `folder` is the run's. With `resume_steps` given (agent decisions at the checkpoint that is resumed)
     what the run wrote after that is removed first, from ``metrics.csv``, TensorBoard events and TorchRL's
     CSV files (damaged rows too, with a message and a copy of the file as it was); W&B and MLflow keep it: W&B
-    continues the same run, MLflow starts another one. Log a row before the checkpoint of its iteration is
+    resumes the same run, MLflow starts another one. Log a row before the checkpoint of its iteration is
     written, and no row is lost either. `console`: where progress and messages go, standard output by default.
 
     Raises ConfigError for a logger that is not installed, and for a new run in a folder that has metrics.
@@ -82,6 +81,7 @@ class RunLog:
         self._progress = Progress(self._console, max_steps) if cfg.progress else None
         self._metrics = MetricsFile(metrics)
 
+        # TensorBoard writes from a thread, whose errors Python would print in the middle of ours.
         self._excepthook = threading.excepthook
         threading.excepthook = self._on_thread_error
 
@@ -153,6 +153,7 @@ class RunLog:
             with suppress(OSError):
                 _close_logger(self._loggers.pop())
 
+        # Last: a writing thread may still fail while its logger is closed.
         threading.excepthook = self._excepthook
 
     def _on_thread_error(self, args: threading.ExceptHookArgs) -> None:

@@ -1,9 +1,8 @@
-"""The files that metrics are written to, and how a resumed run continues them.
+"""The files that metrics are written to, and how a resumed run appends to them.
 
-In: rows of numbers by name, each with ``agent_steps``. Out: ``metrics.csv``, one line an iteration. A killed
-run leaves a cut last line and rows later than its last checkpoint; `keep_until` drops both, there and in the
-files of TorchRL's TensorBoard and CSV loggers, before they are appended to. Knows nothing of what the numbers
-mean.
+``metrics.csv`` has one line an iteration: numbers by name, ``agent_steps`` among them. A killed run leaves a
+cut last line and rows later than its last checkpoint; `keep_until` drops both, there and in the files of
+TorchRL's TensorBoard and CSV loggers, before they are appended to.
 """
 
 from __future__ import annotations
@@ -177,6 +176,7 @@ def _split_records(data: bytes) -> Iterator[tuple[int, bytes]]:
         length, crc = _HEADER.unpack_from(data, start)
         first = start + _HEADER.size
         end = first + length + _FOOTER_BYTES
+        # A wrong length would lead anywhere: its checksum is what decides, that of the data is not looked at.
         if crc != masked_crc32c(data[start : start + _LENGTH_BYTES]) or end > len(data):
             return
 

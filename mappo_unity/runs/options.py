@@ -1,7 +1,6 @@
 """The options of a run that is there: to resume it, or to play what was trained in it.
 
-In: a run folder, override lines. Out: a checked `Config`, or a `ConfigError`. The module of env.factory may
-lie where the run found it.
+The module of env.factory may lie where the run found it.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from mappo_unity.runs.folder import CONFIG, factory_folder, find_run
 
 
 def compose_resumed(lines: list[str], base: Path) -> Config:
-    """Compose the options of a run that goes on: its config.yaml, then overrides; raise ConfigError.
+    """Compose the options of a run that is resumed: its config.yaml, then overrides; raise ConfigError.
 
     What says which run it is (env, env.name, the folders) cannot be overridden.
     """
@@ -32,6 +31,7 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
             "leave env out, or start a new run without resume"
         )
 
+    # The same env given again is no change; its preset must not come on top of what was saved.
     rest = [line for line in lines if parse([line])[0].key_or_group != "env"]
     for key in ("env.name", "output_dir", "hydra.run.dir"):
         if last_value(rest, key) is not None:
@@ -67,6 +67,7 @@ def config_to_play(run: Path, env: str | None) -> Config:
         folder = find_run(run, "run")
         config = load_config(folder / CONFIG)
     except ConfigError as error:
+        # A file of a policy can be played without its run, once the environment is named.
         if not run.is_file() and not list(run.glob("*.onnx")):
             raise
         choices = ", ".join(group_choices()["env"])

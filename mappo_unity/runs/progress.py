@@ -1,7 +1,4 @@
-"""The progress of a run on the terminal: one line that is updated in place, or now and then a plain line.
-
-In: rows of metrics. Out: text on a rich console. Knows nothing of files and loggers.
-"""
+"""The progress of a run on the terminal: one line that is updated in place, or now and then a plain line."""
 
 from __future__ import annotations
 
