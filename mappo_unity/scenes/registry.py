@@ -1,8 +1,8 @@
 """All scenes by name: one record says where a scene's class, drawing and stated ranges are.
 
-In: a scene's name. Out: the scene, its drawing, its ranges. The scenes are those of this package and those
-that installed packages name as entry points of the group `mappo_unity.scenes` (README.md). A module is
-imported when something of it is asked for, so that listing the names imports no scene.
+The scenes are those of this package and those that installed packages name as entry points of the group
+`mappo_unity.scenes` (README.md). A module is imported when something in it is needed, so that listing the
+names imports no scene.
 """
 
 from __future__ import annotations

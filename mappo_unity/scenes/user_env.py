@@ -1,8 +1,8 @@
-"""A user's environment, whose errors are told as the user's.
+"""A user's environment, whose errors are reported as the user's.
 
-In: a BaseEnv made by env.factory. Out: the same, but whatever it raises ends the run as a `ConfigError`
-(before its first step) or an `EnvironmentFailure`, with the user's frames of the traceback; a `close` that
-raises is only noted, because what was done before stands. Knows nothing of options.
+It wraps a BaseEnv made by env.factory: whatever that raises ends the run as a `ConfigError` (before its first
+step) or an `EnvironmentFailure`, with the user's frames of the traceback. A `close` that raises is only
+noted, because what was done before stands.
 """
 
 from __future__ import annotations

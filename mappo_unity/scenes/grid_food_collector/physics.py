@@ -1,13 +1,11 @@
 """Physics of the food arena: upright boxes (agents) and rolling balls (food) on a floor within four walls.
 
-In: poses and velocities of all areas. Out: the same, one tick later, and which agent touched which ball.
-Knows no rewards. Plain numpy, all areas at once; why no rigid-body engine: fifty free balls an area cost
-MuJoCo three to five times as much, and the doubled friction of boxes needs explicit rules anyway
-(`ground.py`).
+Plain numpy, all areas at once; why no rigid-body engine: fifty free balls an area cost MuJoCo three to five
+times as much, and the doubled friction of boxes needs explicit rules anyway (`ground.py`).
 
 A tick follows Unity's engine: free motion; contacts of the poses at the start (gaps below 0.02 m count);
-inelastic impulses, friction after them (`food_solver.py`); motion; penetrations shrink without leaving a
-velocity behind. Legend: N areas, A agents, F balls of an area, B = N * (A + F) bodies, C contacts. Vectors
+inelastic impulses, friction after them (`solver.py`); motion; penetrations shrink without leaving a velocity
+behind. Legend: N areas, A agents, F balls of an area, B = N * (A + F) bodies, C contacts. Vectors
 are component first, Unity's axes (x right, y up, z forward), metres from the middle of the area's floor.
 """
 

@@ -1,8 +1,8 @@
 """GridFoodCollector: five agents an area collect good food, avoid bad food and freeze each other by laser.
 
-Facts: docs/scenes/GridFoodCollector.md. Contacts: food_physics.py; laser: food_laser.py; observation:
-grid_sensor.py. Legend: N areas, A agents and F foods of an area; slot = area * A + agent. Heights count from
-the floor, which lies 0.5 m above the area's origin in Unity.
+Facts: docs/scenes/GridFoodCollector.md. Contacts: `physics.py`; laser: `laser.py`; observation:
+`grid_sensor.py` of the core. Heights count from the floor, which lies 0.5 m above the area's origin in Unity.
+Legend: N areas, A agents and F foods of an area; slot = area * A + agent.
 """
 
 from __future__ import annotations

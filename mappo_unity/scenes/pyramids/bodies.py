@@ -1,8 +1,5 @@
 """Agents, switches and stone pyramids of Pyramids: how agents move and what stops them.
 
-In: changes of velocity. Out: poses, and who touches the switch. Knows no rewards, bricks or
-sensors.
-
 Upright boxes with the contact rules of `ground.py`. Stone pyramids do not give way (a declared
 simplification); a switch stays in its place but turns about the vertical under any push off its centre.
 Legend: N areas, one agent each.

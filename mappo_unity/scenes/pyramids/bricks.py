@@ -1,8 +1,5 @@
 """The brick pyramid of Pyramids: 25 cubes and the goal on top, which topple, on MuJoCo.
 
-In: where a pyramid appears, what surrounds it, how the agent moves. Out: the cubes' poses, the agent's motion
-among them, and whether it touches the goal. Knows no rewards or episodes.
-
 Each area's pile is in one of four modes: absent; falling, along a recording made once (a pile that falls
 untouched always falls alike); asleep, at rest; awake, stepped by MuJoCo together with its area's agent. It
 wakes when the agent or a turning switch may reach a cube, and sleeps when all cubes are at rest and out of
@@ -239,7 +236,7 @@ def _area_spec() -> mujoco.MjSpec:
     """Return the MuJoCo description of one area: still walls, switch and stones (mocap), agent, pile.
 
     The agent slides without friction on the floor and meets only the pile: all its other contacts are
-    rules of `pyramids_bodies.py`. Its yaw is set, not pushed. The outer walls have no top, so that nothing
+    rules of `bodies.py`. Its yaw is set, not pushed. The outer walls have no top, so that nothing
     leaves the area.
     """
     walls = "".join(_box("", *wall) for wall in INNER_WALLS)

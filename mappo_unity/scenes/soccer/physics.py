@@ -1,6 +1,5 @@
 """The bodies of soccer fields as discs on a plane: one tick of all fields at once.
 
-In: velocity changes of the agents, and who kicks. Out: positions, contacts begun, goals. Knows no rules.
 Facts and reasons: docs/scenes/SoccerTwos.md. A tick, as in Unity's engine: forces and drag; contacts that
 exist at the start (gap < 0.02 m) are solved; bodies move, stopped by the pitch (continuous detection; pairs
 of bodies are not swept); then the callbacks: kicks, goals.

@@ -1,7 +1,7 @@
 """SoccerTwos and StrikersVsGoalie: the rules of Unity's soccer scenes.
 
-Facts: docs/scenes/SoccerTwos.md and docs/scenes/StrikersVsGoalie.md. Bodies: soccer_physics.py; what
-agents see: soccer_view.py.
+Facts: docs/scenes/SoccerTwos.md and docs/scenes/StrikersVsGoalie.md. Bodies: `physics.py`; what
+agents see: `view.py`.
 Legend: F fields (areas), A agents of a field, S = F * A slots; slot = field * A + agent.
 """
 

@@ -1,6 +1,5 @@
 """What soccer's agents see: sphere casts in a plane against ball, agents, walls, nets and posts.
 
-In: the bodies and headings of a field. Out: frames of ray sensors. Knows no rules and no stacks.
 Facts: docs/scenes/SoccerTwos.md. All casts run level at a height of 1 m, so they are casts of a disc of 0.5 m
 among upright shapes: ball and agents, whose centres are 0.5 m lower, are met at sqrt((R + 0.5)^2 - 0.5^2),
 walls at their inner faces and, where these end in the open, at their edges.

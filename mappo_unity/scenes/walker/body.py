@@ -1,8 +1,6 @@
 """The Walker's body: its 16 parts and 13 driven joints as tables, and the MuJoCo area made from them.
 
-In: nothing. Out: `AREA` descriptions for `AreaPhysics`, the order of parts and joint axes, limits, drives.
 Facts: docs/scenes/Walker.md. Unity's numbers and axes (x right, y up, z forward, metres, kg, degrees).
-Knows neither actions nor rewards.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The Walkers of all areas in motion: drives, poses, velocities and heights above the ground.
 
-In: drive targets by hinge. Out: arrays by area and part, in the order of `walker_body.PARTS`.
-Knows neither actions, rewards nor episodes. Legend: N areas, B = 16 parts, J = 26 hinges.
+Arrays are by area and part, in the order of `body.PARTS`. Legend: N areas, B = 16 parts, J = 26 hinges.
 """
 
 from __future__ import annotations

@@ -4,7 +4,6 @@ The agent is a box that only turns about the vertical, the block slides at a fix
 so all contacts are planes between upright boxes; see `ground.py`. As in Unity, one step of 20 ms with
 discrete collision detection: a fast body may overlap for a few ticks, until it is pushed out at 10 m/s.
 
-In: drives and accelerations by area. Out: places and velocities. Knows nothing of agents or rewards.
 Area coordinates: x right, y up, z forward; metres. Legend: N areas.
 """
 

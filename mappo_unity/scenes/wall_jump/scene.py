@@ -1,7 +1,7 @@
 """WallJump: reach the goal behind a wall of no, small or big height; the big one needs the block.
 
 Facts: docs/scenes/WallJump.md. One agent an area; the wall's height of each episode decides whether the agent
-asks as SmallWallJump or as BigWallJump. Bodies: `wall_jump_bodies.py`. Legend: N areas = slots.
+requests decisions as SmallWallJump or as BigWallJump. Bodies: `bodies.py`. Legend: N areas = slots.
 """
 
 from __future__ import annotations
