@@ -36,6 +36,7 @@ def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapp
             frames of the traceback), or returned no BaseEnv. ConfigError and EnvironmentFailure of its own
             pass.
     """
+    # First, so that a TypeError from within the factory is not taken for a wrong parameter.
     check_call(factory, name, params)
 
     try:

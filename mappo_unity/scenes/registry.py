@@ -92,7 +92,7 @@ def make_scene(name: str, seed: int = 0, **params: Any) -> Scene:
     if record.package is None:
         return scene_class(seed=seed, **params)
 
-    # A package's scene is called like a user's factory: what it raises is told as the package's.
+    # A package's scene is called like a user's factory: what it raises is reported as the package's.
     from mappo_unity.scenes.factory import call_factory
 
     _check_class(scene_class, record)

@@ -37,6 +37,7 @@ class GuardedEnv(BaseEnv):
         if attribute == "_env":  # not there yet, in a copy that is being made
             raise AttributeError(attribute)
 
+        # Not methods of this class: hasattr must say what the user's environment has.
         value = getattr(self._env, attribute)
         if attribute in ("get_state", "set_state"):
             return lambda *arguments: self._call(attribute, value, *arguments)
@@ -50,6 +51,7 @@ class GuardedEnv(BaseEnv):
 
     def step(self) -> None:
         """Step the environment."""
+        # Before the call: what the first step raises is a failure, not a mistake in the options.
         self._has_stepped = True
         self._call("step", self._env.step)
 

@@ -75,7 +75,7 @@ def play(env: Any, steps: int, rng: np.random.Generator, report: Report) -> Trac
 
 
 def _checked(check: RecordCheck, result: Any) -> tuple[DecisionSteps, TerminalSteps]:
-    """Check a result more strictly than who only reads it: also the types, and the shapes of empty arrays."""
+    """Check a result more strictly than its readers do: also the types, and the shapes of empty arrays."""
     check(result)
 
     for steps in result:

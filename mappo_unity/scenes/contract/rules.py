@@ -120,6 +120,7 @@ def check_plain(value: Any, where: str) -> None:
         for number, item in enumerate(value):
             check_plain(item, f"{where}[{number}]")
     else:
+        # Exact types, and no arrays of objects: a checkpoint opens without running any class's code.
         is_array = isinstance(value, (np.ndarray, np.generic)) and value.dtype != object
         if not is_array and type(value) not in (int, float, str, bool, type(None)):
             raise EnvironmentDataError(

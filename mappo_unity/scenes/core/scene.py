@@ -1,7 +1,6 @@
 """The stepping loop that every embedded scene stands on: Unity ML-Agents' framework rules, vectorised.
 
-A scene adds declarations and hooks to it (../README.md says how); `tick` says in what order the hooks are
-called.
+A scene adds declarations and hooks (../README.md); `tick` says in what order the hooks are called.
 """
 
 from __future__ import annotations
@@ -283,6 +282,7 @@ class Scene(BaseEnv):
         self.agents.set_state(state["agents"])
         self.records.set_state(state["stacks"])
         self.exchange.results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]
+        # After the agents: it parts them by the behaviors that they have now.
         self.exchange.ask(state["asked"].copy())
         self.load_scene_state(state["state"])
 

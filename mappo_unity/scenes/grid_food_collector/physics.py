@@ -88,6 +88,7 @@ class FoodPhysics:
         self._solver.separate(contacts, self._position)
         self._position[1, :-1] += push_out(floor_gap)
 
+        # In a touch the one is the ball, the other the agent.
         area, agent = np.divmod(touches.other, self._shape[1])
         return area, agent, touches.one % self._shape[1] - self._num_agents
 
@@ -153,6 +154,7 @@ class FoodPhysics:
         """Find balls at balls."""
         num, circle = self._num_balls, self._circle
         circle[:, :, :num] = self.ball_position[::2]
+        # The first half again: so each ball has the balls that follow it in one window.
         circle[:, :, num:] = circle[:, :, : num // 2]
 
         # A coarse look from above, in single precision: few of all the pairs are near.
@@ -186,6 +188,7 @@ class FoodPhysics:
         offset = self.agent_position[:, :, first] - self.agent_position[:, :, second]
         sizes = self.agent_half[:, first] + self.agent_half[:, second]
         reach = np.sqrt(2) * sizes + CONTACT_GAP
+        # A coarse look from above: boxes lie within the circles through their corners.
         area, pair = np.nonzero(offset[0] ** 2 + offset[2] ** 2 < reach**2)
         if not area.size:
             return NONE

@@ -90,6 +90,7 @@ class GridFoodCollector(Scene):
         area, agent = np.divmod(slots, AGENTS)
         physics = self.physics
         place, yaw = physics.agent_position[:, area, agent], physics.agent_yaw[area, agent]
+        # The agent's size spreads the cells of its grid; the cells themselves stay as large.
         scale = 2 * physics.agent_half[area, agent]
         view = grid_sensor.View(place[0], place[2], np.sin(yaw), np.cos(yaw), scale)
 
@@ -136,6 +137,7 @@ class GridFoodCollector(Scene):
 
         if area.size:
             reward = self._food_rewards[food]
+            # An agent may eat several at once, of which an indexed sum would count one.
             self.agents.reward += np.bincount(area * AGENTS + agent, reward, self.num_slots).astype(
                 np.float32
             )

@@ -116,6 +116,7 @@ class Solver:
         one, other, normal, _, _ = contacts
         mass, inertia = self.inverse_mass, self.inverse_inertia
 
+        # A contact lies on opposite sides of two balls, so their spins add up in the slip.
         slip = velocity[:, one] - velocity[:, other]
         slip -= self.radius * _cross(spin[:, one] + spin[:, other], normal)
         slip -= normal * (slip * normal).sum(axis=0)
@@ -126,6 +127,7 @@ class Solver:
         mobility = share * (mass + self.radius**2 * inertia)
         impulse = np.minimum(speed / (mobility[one] + mobility[other]), limit)
 
+        # Opposite impulses on opposite sides: the torque is the same on both.
         torque = _cross(normal, slip) * (self.radius * impulse)
         slip *= impulse
         _add(velocity, cells, np.concatenate([slip * -mass[one], slip * mass[other]], axis=1))

@@ -131,6 +131,7 @@ class PyramidsBricks:
             return goal
 
         physics = self._physics
+        # the engine moves agents along x and z only: their heading is set, so that nothing spins them
         physics.qpos[areas, 0], physics.qpos[areas, 1] = position[areas, 0], position[areas, 2]
         physics.qpos[areas, 2] = yaw[areas]
         physics.qvel[areas, 0], physics.qvel[areas, 1] = velocity[areas, 0], velocity[areas, 2]
@@ -173,6 +174,7 @@ class PyramidsBricks:
             self.bodies[areas, :, 0] += self.root[areas, :1]
             self.bodies[areas, :, 2] += self.root[areas, 1:]
 
+            # speeds too: a pile that wakes while it falls falls on
             self._speeds[areas] = speeds[tick]
             self.clock[areas] += 1
             self._sleep(areas[tick + 1 == FALL_TICKS])

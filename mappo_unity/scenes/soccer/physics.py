@@ -149,6 +149,7 @@ class SoccerPhysics:
         squared = squares[0] + squares[1]
         close = squared < self._reach_squared
 
+        # the first pairs are those of the ball with each agent
         touching = close[: self.num_agents]
         begun = touching > self.touching
         self.touching = touching
@@ -158,6 +159,7 @@ class SoccerPhysics:
             parts.append(self._pairs(close, away, squared))
 
         at = self._flat(position)
+        # mostly known from the end of the last tick
         if self._gaps is None:
             self._gaps = self.pitch.gaps(at, self._radii)
 

@@ -199,6 +199,7 @@ class Pitch:
         a, b = _dot(d, d), _dot(m, d)
 
         inside = b * b - a * (_dot(m, m) - (radius - _ROUNDING) ** 2)
+        # on the way there, and the first root within the way
         hit = np.flatnonzero((b < 0) & (inside > 0) & (-b - np.sqrt(np.maximum(inside, 0)) < a))
         if not hit.size:
             return _NOTHING, _NOTHING.gap

@@ -189,6 +189,7 @@ class _Layout:
 
     def __init__(self, counts: Sequence[int], views: Sequence[_Rays], num_columns: int) -> None:
         rays = [len(view.angles) for view in views]
+        # rays stand behavior by behavior, then agent by agent
         behavior = np.repeat(np.arange(len(views)), np.multiply(counts, rays))
 
         numbers = np.array([view.numbers for view in views])[behavior]
@@ -201,6 +202,7 @@ class _Layout:
         self.every = np.arange(len(behavior))
         self.number = numbered(num_columns, len(behavior))
 
+        # a ray's numbers: one for each tag, whether it missed, and last the distance
         self.size = int(numbers.sum())
         self.last = np.cumsum(numbers) - 1
         self.first = self.last - (numbers - 1)

@@ -211,6 +211,7 @@ class WallJump(Scene):
     def _steer_jumps(self, slots: np.ndarray, direction: np.ndarray) -> None:
         """Move velocities towards the jump's target, at once; the drive is added by the physics step."""
         bodies = self.bodies
+        # horizontally the target moves along with the agent's own drive
         way = direction[slots]
         way[:, 1] = self.jump_start_y[slots] + JUMP_HEIGHT - bodies.position[slots, 1]
 
