@@ -1,8 +1,7 @@
-"""Environments of a user's own: package.module:function to a BaseEnv.
+"""Environments of a user's own: from the name package.module:function to a BaseEnv.
 
-In: the function's name, a seed and parameters. Out: the environment; what the user's code raises becomes one
-line, with the user's frames of the traceback. There is one rule for where modules are found: Python's path,
-and the working directory.
+What the user's code raises becomes one line, with the user's frames of the traceback. There is one rule for
+where modules are found: Python's path, and the working directory.
 """
 
 from __future__ import annotations
@@ -37,6 +36,7 @@ def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapp
             frames of the traceback), or returned no BaseEnv. ConfigError and EnvironmentFailure of its own
             pass.
     """
+    # First, so that a TypeError from within the factory is not taken for a wrong parameter.
     check_call(factory, name, params)
 
     try:

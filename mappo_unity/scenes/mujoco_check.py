@@ -1,4 +1,4 @@
-"""Whether MuJoCo can be loaded here, asked where a plain import would end in a traceback."""
+"""A check whether MuJoCo can be loaded here, for use where a plain import would end in a traceback."""
 
 from __future__ import annotations
 

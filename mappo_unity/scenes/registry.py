@@ -1,8 +1,8 @@
 """All scenes by name: one record says where a scene's class, drawing and stated ranges are.
 
-In: a scene's name. Out: the scene, its drawing, its ranges. The scenes are those of this package and those
-that installed packages name as entry points of the group `mappo_unity.scenes` (README.md). A module is
-imported when something of it is asked for, so that listing the names imports no scene.
+The scenes are those of this package and those that installed packages name as entry points of the group
+`mappo_unity.scenes` (README.md). A module is imported when something in it is needed, so that listing the
+names imports no scene.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def make_scene(name: str, seed: int = 0, **params: Any) -> Scene:
     if record.package is None:
         return scene_class(seed=seed, **params)
 
-    # A package's scene is called like a user's factory: what it raises is told as the package's.
+    # A package's scene is called like a user's factory: what it raises is reported as the package's.
     from mappo_unity.scenes.factory import call_factory
 
     _check_class(scene_class, record)

@@ -1,8 +1,8 @@
-"""A user's environment, whose errors are told as the user's.
+"""A user's environment, whose errors are reported as the user's.
 
-In: a BaseEnv made by env.factory. Out: the same, but whatever it raises ends the run as a `ConfigError`
-(before its first step) or an `EnvironmentFailure`, with the user's frames of the traceback; a `close` that
-raises is only noted, because what was done before stands. Knows nothing of options.
+It wraps a BaseEnv made by env.factory: whatever that raises ends the run as a `ConfigError` (before its first
+step) or an `EnvironmentFailure`, with the user's frames of the traceback. A `close` that raises is only
+noted, because what was done before stands.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ class GuardedEnv(BaseEnv):
         if attribute == "_env":  # not there yet, in a copy that is being made
             raise AttributeError(attribute)
 
+        # Not methods of this class: hasattr must say what the user's environment has.
         value = getattr(self._env, attribute)
         if attribute in ("get_state", "set_state"):
             return lambda *arguments: self._call(attribute, value, *arguments)
@@ -50,6 +51,7 @@ class GuardedEnv(BaseEnv):
 
     def step(self) -> None:
         """Step the environment."""
+        # Before the call: what the first step raises is a failure, not a mistake in the options.
         self._has_stepped = True
         self._call("step", self._env.step)
 

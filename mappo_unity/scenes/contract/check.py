@@ -1,7 +1,6 @@
-"""The contract of a `BaseEnv`, as a checker that any environment can be run against.
+"""The checker of the contract of a `BaseEnv`: it plays any environment and sums up what it saw.
 
-In: an environment; on the command line a scene's name, or the factory of an environment of one's own. Out: a
-summary, or `ContractError` that names the behavior, the agent and what is wrong. Knows nothing of any scene.
+A broken rule ends it with a `ContractError` that names the behavior, the agent and what is wrong.
 
     python -m mappo_unity.scenes.check 3DBall [--steps 500] [--num-areas 4]
     python -m mappo_unity.scenes.check package.module:function [env.params.NAME=VALUE ...]
@@ -112,7 +111,7 @@ def _check_shown(specs: Any) -> None:
 
 
 def _check_errors(env: Any) -> None:
-    """Check that wrong names, wrong shapes and agents that did not ask are refused."""
+    """Check that wrong names, wrong shapes and agents that requested no decision are refused."""
     name, spec = next(iter(env.behavior_specs.items()))
     decisions, _ = RecordCheck(name, spec)(env.get_steps(name))
 
@@ -128,7 +127,7 @@ def _check_errors(env: Any) -> None:
 
     _require_raises("get_steps of an unknown behavior", lambda: env.get_steps("no such behavior"))
 
-    # After all refusals an agent that did ask is still served.
+    # After all refusals an agent that requested a decision is still served.
     if len(decisions):
         env.set_action_for_agent(name, int(decisions.agent_id[0]), one)
 
@@ -158,6 +157,7 @@ def _check_determinism(remake: Callable[[], BaseEnv], steps: int, seed: int) -> 
 
 
 def _require_equal(one: Trace, other: Trace, message: str) -> None:
+    # Both have the same names in the same order: a step without records adds empty arrays.
     for (where, a), (_, b) in zip(one, other):
         require(a.shape == b.shape and bool((a == b).all()), f"{message} (first {where})")
 

@@ -1,7 +1,6 @@
-"""The life of agents as a BaseEnv's records tell it: asked, ended, asked again, always under one behavior.
+"""The life of agents as a BaseEnv's records tell it: requested, ended, requested again, under one behavior.
 
-In: checked decision and terminal steps, result by result. Out: nothing, or a `ContractError` that names the
-agent. Knows nothing of shapes or numbers.
+It takes checked decision and terminal steps, result by result; shapes and numbers are checked in `records`.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class Lives:
         for agent, group_id in zip(steps.agent_id.tolist(), steps.group_id.tolist(), strict=True):
             known = self._agents.get(agent)
             if known is None:
-                # It ended before it ever asked.
+                # It ended before its first request.
                 self._agents[agent] = _Agent(name, group_id, ended=True)
                 continue
 
@@ -56,7 +55,7 @@ class Lives:
             known.ended = True
 
     def ask(self, name: str, steps: DecisionSteps) -> None:
-        """Take in the decisions that a behavior's agents ask for."""
+        """Take in the decisions that a behavior's agents request."""
         for agent, group_id in zip(steps.agent_id.tolist(), steps.group_id.tolist(), strict=True):
             require(
                 agent not in self._asked,

@@ -1,7 +1,7 @@
 """A checked play: an environment with random actions, every record looked at.
 
-In: a BaseEnv that was reset. Out: what it sent, and counts of it, or an error that names the behavior, the
-agent and the broken rule. Stricter than who only reads records: types and empty arrays must be right, too.
+The environment must have been reset. The check is stricter than the code that only reads records: types and
+empty arrays must be right, too.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def play(env: Any, steps: int, rng: np.random.Generator, report: Report) -> Trac
         records = {name: _checked(checks[name], env.get_steps(name)) for name in specs}
         lives.begin_result()
 
-        # All ends first: an agent may end and ask again in one result.
+        # All ends first: an agent may end and request again in one result.
         for name, (_, terminals) in records.items():
             lives.end(name, terminals)
             num_terminals += len(terminals)
@@ -75,7 +75,7 @@ def play(env: Any, steps: int, rng: np.random.Generator, report: Report) -> Trac
 
 
 def _checked(check: RecordCheck, result: Any) -> tuple[DecisionSteps, TerminalSteps]:
-    """Check a result more strictly than who only reads it: also the types, and the shapes of empty arrays."""
+    """Check a result more strictly than its readers do: also the types, and the shapes of empty arrays."""
     check(result)
 
     for steps in result:

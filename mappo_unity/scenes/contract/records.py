@@ -1,8 +1,7 @@
 """What a BaseEnv must send: decision and terminal steps that fit its behaviors.
 
-In: what `get_steps` returned for a behavior. Out: the same records, or an `EnvironmentDataError` that names
-the behavior, the agent and the rule. Whoever reads records checks them here: the adapter in every step,
-evaluation, and the contract checker. Knows nothing of what is done with them.
+Whoever reads records checks them here: the adapter in every step, evaluation, and the contract checker. What
+breaks a rule is an `EnvironmentDataError` that names the behavior, the agent and the rule.
 """
 
 from __future__ import annotations
@@ -91,7 +90,7 @@ class RecordCheck:
 
     def _check_ids(self, steps: Steps) -> None:
         """Refuse ids that stand twice in a result, and negative ones (which stand for free places here)."""
-        # Mostly the same agents ask again: equal ids were looked at already.
+        # Mostly the same agents request again: equal ids were looked at already.
         seen = steps.agent_id.tobytes()
         if seen == self._unique.get(type(steps)):
             return

@@ -1,7 +1,7 @@
-"""What a BaseEnv must show before anybody can play it: behaviors with sensors and actions, agents that ask.
+"""What a BaseEnv must show before it can be played: behaviors with sensors and actions, agents that request.
 
-In: `behavior_specs`, counts of steps. Out: nothing, or an `EnvironmentDataError` that names the behavior and
-the rule. `record_check` looks at what the agents send.
+What breaks a rule is an `EnvironmentDataError` that names the behavior and the rule. `records` looks at what
+the agents send.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mlagents_envs.base_env import ActionSpec, BehaviorSpec, ObservationSpec
 
 from mappo_unity.errors import ConfigError
 
-MAX_SILENT_STEPS = 100_000  # BaseEnv steps in a row in which nobody asks before that is called an error
+MAX_SILENT_STEPS = 100_000  # BaseEnv steps in a row without a request before that is an error
 SILENCE_NOTED = 1_000  # steps in a row after which it is said
 LISTS = (tuple, list)
 
@@ -64,6 +64,7 @@ def check_specs(specs: Any) -> None:
             )
         _check_spec(name, spec)
 
+    # A policy is named by what precedes the "?": Game and Game?team=0 would be mixed up.
     for name in specs:
         side = next((other for other in specs if other.startswith(f"{name}?")), None)
         if side is not None:
@@ -119,6 +120,7 @@ def check_plain(value: Any, where: str) -> None:
         for number, item in enumerate(value):
             check_plain(item, f"{where}[{number}]")
     else:
+        # Exact types, and no arrays of objects: a checkpoint opens without running any class's code.
         is_array = isinstance(value, (np.ndarray, np.generic)) and value.dtype != object
         if not is_array and type(value) not in (int, float, str, bool, type(None)):
             raise EnvironmentDataError(
@@ -128,7 +130,7 @@ def check_plain(value: Any, where: str) -> None:
 
 
 def note_silence(steps: int, limit: int) -> None:
-    """Say once, after some steps in which nobody asked, how long that is borne."""
+    """Say once, after some steps without a request, how many more are allowed."""
     if steps == SILENCE_NOTED:
         logger.warning(
             "no agent has requested a decision for %d environment steps in a row; after %d that is an error",
@@ -137,7 +139,7 @@ def note_silence(steps: int, limit: int) -> None:
 
 
 def silence_error(steps: int) -> EnvironmentDataError:
-    """Return the error of an environment in which nobody asks any more."""
+    """Return the error of an environment in which nobody requests a decision any more."""
     return EnvironmentDataError(
         f"no agent asked for a decision in {steps} environment steps in a row: get_steps gave no "
         "DecisionSteps. In Unity every agent needs a DecisionRequester; step() of an environment of your own "
@@ -156,7 +158,7 @@ def show_kind(value: Any) -> str:
 
 
 def _are_same(specs: Any, first: Mapping[str, BehaviorSpec]) -> bool:
-    """Whether these are the very same specs; quick, since it is asked in every round."""
+    """Whether these are the very same specs; quick, since every round calls it."""
     try:
         return len(specs) == len(first) and all(specs[name] is spec for name, spec in first.items())
     except (KeyError, TypeError):

@@ -1,1 +1,1 @@
-"""What all scenes share: the stepping loop, records, sensors, physics, the contract of a BaseEnv."""
+"""What all scenes share: the stepping loop, records, sensors, physics."""

@@ -1,7 +1,4 @@
-"""What an action must be: its shape, finite numbers, indices within their branches.
-
-In: the actions that Python sets. Out: nothing, or an error that names the agent. Knows no scene.
-"""
+"""What an action must be: its shape, finite numbers, indices within their branches."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """The agents of all areas as arrays: who is enabled, their ids, groups, rewards, counters and actions.
 
-In: events by slot. Out: arrays by slot. A *slot* is the place of an agent object: slot = area * (agents
-of an area) + its number in the area. A slot keeps its place for good; its agent id changes when the
-object is disabled and enabled again. Knows nothing of records or observations.
+A *slot* is the place of an agent object: slot = area * (agents of an area) + its number in the area. A slot
+keeps its place for good; its agent id changes when the object is disabled and enabled again.
 """
 
 from __future__ import annotations
@@ -98,6 +97,7 @@ class Agents:
 
     def store_actions(self, slots: np.ndarray, continuous: np.ndarray, discrete: np.ndarray) -> None:
         """Store the actions of `slots`, one row each; columns that their behavior lacks stay."""
+        # Everybody in the order of slots is the common case, and a slice is faster than indices.
         rows = slice(None) if slots is self._order and self._is_slot_order else slots
         if continuous.shape[1]:
             self.continuous[rows, : continuous.shape[1]] = continuous

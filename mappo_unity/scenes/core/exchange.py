@@ -1,7 +1,4 @@
-"""What Python and a scene exchange between two steps: who was asked, records out, checked actions in.
-
-In: the agents, and the records of a tick. Out: their stored actions. Knows nothing of ticks and rules.
-"""
+"""What Python and a scene exchange between two steps: requests, records out, checked actions in."""
 
 from __future__ import annotations
 
@@ -19,9 +16,9 @@ from mappo_unity.scenes.core.specs import Behavior
 class Exchange:
     """Hold the last exchange of a scene with Python.
 
-    Attributes: `specs`, of all behaviors; `asked`, slots of all agents asked for a decision; `asked_rows`,
-    the same for each behavior, in the order of Python's rows; `results`, records of each behavior (empty
-    before the first exchange).
+    Attributes: `specs`, of all behaviors; `asked`, slots of all agents that requested a decision;
+    `asked_rows`, the same for each behavior, in the order of Python's rows; `results`, records of each
+    behavior (empty before the first exchange).
     """
 
     def __init__(self, scene: str, behaviors: Sequence[Behavior], agents: Agents) -> None:
@@ -36,7 +33,7 @@ class Exchange:
         self.results: list[tuple[DecisionSteps, TerminalSteps]] = []
 
     def ask(self, slots: np.ndarray) -> None:
-        """Ask agents for a decision; `slots` are in the order of Python's rows."""
+        """Note who requests a decision; `slots` are in the order of Python's rows."""
         self.asked = slots
 
         # The first two cases are what nearly every tick is: everybody, nobody.
@@ -56,14 +53,14 @@ class Exchange:
         return self.results[behavior]
 
     def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
-        """Store the actions of all agents of a behavior that were asked."""
+        """Store the actions of all agents of a behavior that requested a decision."""
         behavior = self._behavior(behavior_name)
         slots = self.asked_rows[behavior]
         self._checks[behavior](action, self._agents.agent_id[slots])
         self._agents.store_actions(slots, action.continuous, action.discrete)
 
     def set_action_for_agent(self, behavior_name: str, agent_id: int, action: ActionTuple) -> None:
-        """Store the action of one agent that was asked; raises IndexError for any other."""
+        """Store the action of one agent that requested a decision; raises IndexError for any other."""
         behavior = self._behavior(behavior_name)
         slots = self.asked_rows[behavior]
         slot = slots[self._agents.agent_id[slots] == agent_id]

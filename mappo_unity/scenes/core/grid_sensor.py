@@ -1,7 +1,5 @@
 """Unity's grid sensor: a square of cells around an agent, each showing the tag of what lies in it.
 
-In: shapes as seen from the agents. Out: one-hot grids float32 [n, tags, 40, 40]. Knows no scene.
-
 Cell (h, w) of a grid has its middle at right = (19.5 - h) * scale, ahead = (w - 19.5) * scale of its agent:
 w grows forwards, h to the left. It is tested with a box of half-sizes 0.5, 0.01, 0.5 m (not scaled) at the
 height of the agent's centre, turned with the agent. Of several things in a cell the one wins whose
@@ -145,7 +143,7 @@ def one_hot(view: View, num_tags: int, parts: list[Painted]) -> np.ndarray:
     shape = np.concatenate([part.shape + start for part, start in zip(parts, boxes[:-1], strict=True)])
 
     # Nearly every cell has one shape: whoever wrote last owns it, and only disputed cells are compared.
-    key = row * CELLS**2 + cell
+    key = row * CELLS**2 + cell  # of all agents' cells in a row
     number = np.arange(key.size)
     owner = np.empty(len(view.x) * CELLS**2, np.int64)  # read only where it is written
     owner[key] = number
@@ -180,6 +178,7 @@ def _in_sight(
     row, column = np.nonzero(seen)
     right, ahead, reach, step = right[seen], ahead[seen], reach[seen], view.scale[row]
 
+    # h falls to the right, so a shape's first h is that of its right edge.
     count = int((2 * reach / step).max(initial=0.0)) + 1
     first_h = np.ceil(MIDDLE - (right + reach) / step)
     first_w = np.ceil(MIDDLE + (ahead - reach) / step)

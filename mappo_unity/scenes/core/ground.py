@@ -6,8 +6,6 @@ boxes, and a plain numpy rule replaces a rigid-body engine. It is needed where o
 0.6 + 0.6 = 1.2, and a soft-contact engine makes a fast box with that friction hop (leave its agent-floor
 contact frictionless and call `slide`).
 
-In: positions, headings and velocities of n boxes. Out: gaps, normals, changed velocities. Knows no scene.
-
 One tick (`TICK_S`) of a scene without an engine, in the order of PhysX:
 
     velocity += drive; velocity[:, 1] -= gravity * TICK_S; velocity *= 1 - drag * TICK_S
@@ -41,7 +39,7 @@ def slide(velocity: np.ndarray, impulse: np.ndarray | float, friction: float = B
     `velocity` ``[n, 3]``, m/s. `impulse` ``[n]`` or one for all: the vertical contact impulse of the tick by
     mass, m/s, that is, the downward speed which the ground has taken; 0 for a box in the air.
     """
-    flat = velocity[:, ::2]
+    flat = velocity[:, ::2]  # x and z: a view, so that `velocity` changes
     speed = np.sqrt(flat[:, 0] ** 2 + flat[:, 1] ** 2)
     loss = friction * impulse
     flat *= (np.maximum(speed - loss, 0.0) / np.maximum(speed, 1e-12))[:, None]
@@ -73,6 +71,7 @@ def axis_gaps(
     the other box to the box.
     """
     along, reach, sin, cos = _projections(offset, yaw, half, other_half, other_yaw)
+    # Not np.sign: at an offset of 0 a normal must have length 1, too.
     sign = np.where(along < 0, -1.0, 1.0)
     normals = np.zeros((5, 3, len(offset)))
     normals[0, 0], normals[1, 1], normals[2, 2] = sign[0], sign[1], sign[2]
@@ -122,6 +121,7 @@ def stop(
     `velocity`, `normal` ``[n, 3]``; `gap` ``[n]``, m, may still be closed within the tick. Inelastic;
     friction takes at most `friction` (``[n]`` or one for all) * impulse of the speed along the surface.
     """
+    # A gap that is still open may be closed within the tick; only faster approach is stopped.
     speed = np.einsum("ni,ni->n", velocity, normal)
     impulse = np.maximum(-speed - np.maximum(gap, 0.0) / TICK_S, 0.0)
     rub = velocity - normal * speed[:, None]

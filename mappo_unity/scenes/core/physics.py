@@ -1,7 +1,5 @@
 """MuJoCo physics of N equal areas: states as arrays by area, stepped together, exact to the bit.
 
-In: the MuJoCo description of one area. Out: positions, velocities and sensor data by area. Knows no scene.
-
 Every step starts from the state alone: warm starts are switched off and `mujoco.rollout` sets all inputs
 anew, so results depend neither on an MjData's history nor on the number of threads, and `get_state` is
 the whole truth between two steps.
@@ -72,7 +70,7 @@ class AreaPhysics:
         models = self._models if areas is None else [self._models[area] for area in areas.tolist()]
         num_models, per_area = len(models), (len(models) * self._per_model, -1)
 
-        # Positions, velocities and inputs into MuJoCo's own rows.
+        # Positions, velocities and inputs into MuJoCo's own rows: clock, positions, velocities, the rest.
         state = self._state[rows]  # of all areas: a view, to be changed in place; of some: a copy
         state[:, 1 : 1 + self._nq] = self._qpos[rows].reshape(num_models, -1)
         state[:, 1 + self._nq : 1 + self._nq + self._nv] = self._qvel[rows].reshape(num_models, -1)
@@ -100,6 +98,7 @@ class AreaPhysics:
             self._sensordata[rows] = sensors[:, -1].reshape(per_area)
             self._last_sensors = sensors
 
+        # One sum is enough to find a bad number: NaN and infinity never vanish from it.
         if not np.isfinite(self._qvel[rows].sum()):
             area = int(np.flatnonzero(~np.isfinite(self._qvel).all(axis=1))[0])
             raise FloatingPointError(f"physics of area {area} is not finite any more")
@@ -121,6 +120,7 @@ class AreaPhysics:
         of `get_state`: the scene sets them again from its own state.
         """
         number = area // self._per_model
+        # Copied on the first request: models whose constants nobody changes stay one object.
         if self._models[number] is self._shared:
             self._models[number] = copy.copy(self._shared)
         prefix = "" if self._per_model == 1 else f"{area % self._per_model}/"
@@ -155,6 +155,7 @@ class AreaPhysics:
         self._sensordata = np.zeros((count, model.nsensordata))
         self._state = np.zeros((len(self._models), mujoco.mj_stateSize(self._shared, _STATE)))
 
+        # MuJoCo keeps mocap poses in the order of their own ids, not of the bodies.
         mocap = model.body_mocapid >= 0
         order = np.argsort(model.body_mocapid[mocap])
         self._input_arrays = {
@@ -200,6 +201,7 @@ def _repeated(area: mujoco.MjSpec, one: mujoco.MjModel, count: int) -> mujoco.Mj
     """Compile `count` copies of an area into one model, named "0/...", "1/..." and so on."""
     assert not (one.geom_contype | one.geom_conaffinity).any(), "several areas a model need explicit pairs"
     parent = mujoco.MjSpec()
+    # Attached areas do not bring their options along.
     for option in (name for name in dir(area.option) if not name.startswith("_")):
         setattr(parent.option, option, getattr(area.option, option))
     for number in range(count):

@@ -1,7 +1,7 @@
 """A ray sensor of Unity ML-Agents: where its rays go, and what an observation of them holds.
 
-In: where agents stand and look, what the casts of `rays.py` found. Out: rays, observations. Knows no scene.
-Rules: sensors of the component "RayPerceptionSensor" (alternating order, right first).
+The casts are those of `rays.py`. Rules: sensors of the component "RayPerceptionSensor" (alternating order,
+right first).
 
     eyes = RaySensor(tags=5, rays_per_side=2, max_degrees=70, length=12)
     sensor = eyes.sensor("RayPerceptionSensor", stack=3)              # in the behavior
@@ -100,6 +100,7 @@ class RaySensor:
         frame[..., -1] = np.where(hit, travelled, 1.0)
         frame[..., -2] = ~hit
 
+        # A collider without a listed tag hides what is behind it: its distance counts, it sets no tag.
         tag = np.broadcast_to(tags, (count, colliders))[np.arange(count)[:, None], nearest]
         listed = hit & (tag >= 0)
         agent, ray = np.nonzero(listed)

@@ -1,7 +1,5 @@
 """Analytic casts of spheres along rays, vectorised, as Unity's ray sensors need them.
 
-In: rays and colliders. Out: travelled distances. Knows no scene; `ray_sensor.py` makes the rays.
-
 Every cast broadcasts over leading axes; a sensor of N agents with R rays against M colliders uses
 [N, R, 1, 3] origins and directions against [N, 1, M, ...] or [M, ...] colliders and gives distances
 [N, R, M], inf where nothing is hit. Distance is the travel of the sphere's centre. A collider that the
@@ -61,7 +59,7 @@ def cast_capsules(
     side, lateral = offset - along[..., None] * unit, direction - slope[..., None] * unit
     a = np.maximum(_dot(lateral, lateral), _TINY)
     body = _entry(_dot(side, lateral) / a, (_dot(side, side) - np.square(total)) / a, False)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # inf * 0 where nothing is met
         place = along + body * slope
     body = np.where((place >= 0) & (place <= length), body, np.inf)
 
@@ -191,6 +189,7 @@ def _enter_slabs(
     enter: np.ndarray | float = 0.0
     leave: np.ndarray | float = np.inf
     for o, d, h in axes:
+        # A ray along a face gets a tiny slope: its slab is left before the start, or not within reach.
         inverse = 1.0 / np.where(np.abs(d) < _TINY, _TINY, d)
         middle, width = -o * inverse, np.abs(inverse) * (h + radius)
         enter = np.maximum(enter, middle - width)

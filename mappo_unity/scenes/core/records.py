@@ -1,7 +1,4 @@
-"""Records as Python sees them: decision steps, terminal steps that wait for an exchange, arrays of both.
-
-In: the agents, new frames of their sensors. Out: `DecisionSteps`, `TerminalSteps`. Knows nothing of rules.
-"""
+"""Records as Python sees them: decision steps, terminal steps that wait for an exchange, arrays of both."""
 
 from __future__ import annotations
 
@@ -55,6 +52,7 @@ class Records:
             agents.group_reward[slots],
         )
 
+        # The record has copies of them.
         agents.reward[slots] = 0
         agents.group_reward[slots] = 0
         agents.done[slots] = False
@@ -72,6 +70,7 @@ class Records:
             agents.group_reward[slots],
         )
 
+        # Only now: the record shows the frames of the episode that has ended.
         self._queue.add(behavior, steps)
         self._stacks.clear(slots)
         agents.finish(slots)

@@ -1,7 +1,6 @@
 """The stepping loop that every embedded scene stands on: Unity ML-Agents' framework rules, vectorised.
 
-In: a scene's declarations and hooks (../README.md says how to write a scene). Out: a
-`mlagents_envs.base_env.BaseEnv`. Knows no scene. `tick` says in what order the hooks are called.
+A scene adds declarations and hooks (../README.md); `tick` says in what order the hooks are called.
 """
 
 from __future__ import annotations
@@ -112,7 +111,7 @@ class Scene(BaseEnv):
         """Run scripts that follow the academy's step (area timers), before physics."""
 
     def decides(self) -> bool | np.ndarray:
-        """Return who asks for a decision this tick: all, none, or a mask bool over slots."""
+        """Return who requests a decision this tick: all, none, or a mask bool over slots."""
         return self.counter % self.DECISION_PERIOD == 0
 
     def action_mask(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
@@ -224,7 +223,7 @@ class Scene(BaseEnv):
         run_to_exchange(self)
 
     def step(self) -> None:
-        """Go on until some agent reports: asks for a decision, or has ended."""
+        """Run ticks until some agent reports: requests a decision, or has ended."""
         self._check_open()
         if not self.started:
             return self.reset()
@@ -283,6 +282,7 @@ class Scene(BaseEnv):
         self.agents.set_state(state["agents"])
         self.records.set_state(state["stacks"])
         self.exchange.results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]
+        # After the agents: it parts them by the behaviors that they have now.
         self.exchange.ask(state["asked"].copy())
         self.load_scene_state(state["state"])
 

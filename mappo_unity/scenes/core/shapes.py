@@ -1,7 +1,7 @@
 """What a drawing consists of: coloured primitive shapes and a camera.
 
-In: plain numbers. Out: plain descriptions, which a renderer turns into pictures. Unity's axes everywhere:
-x right, y up, z forward, metres; left-handed, so a positive yaw turns clockwise seen from above.
+They are plain descriptions, which a renderer turns into pictures. Unity's axes everywhere: x right, y up,
+z forward, metres; left-handed, so a positive yaw turns clockwise seen from above.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """What a scene declares: sensors, behaviors and environment parameters.
 
-In: plain declarations at the top of a scene's module. Out: the `BehaviorSpec` that ML-Agents shows.
-Knows nothing of stepping.
+Declarations stand at the top of a scene's module; a `Behavior` makes the `BehaviorSpec` that ML-Agents shows.
 """
 
 from __future__ import annotations

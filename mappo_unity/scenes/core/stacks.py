@@ -1,7 +1,4 @@
-"""Frame stacks of all agents: oldest frame first, zeros for frames not written since an end.
-
-In: new frames of some agents. Out: their stacked observations. Knows nothing of what a frame means.
-"""
+"""Frame stacks of all agents: oldest frame first, zeros for frames not written since an end."""
 
 from __future__ import annotations
 

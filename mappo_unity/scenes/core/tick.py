@@ -1,7 +1,4 @@
-"""One tick of a scene in Unity's order, cut in two where Unity waits for Python.
-
-In: a scene, whose hooks are called. Out: its agents and its exchange with Python, one tick later.
-"""
+"""One tick of a scene in Unity's order, cut in two where Unity waits for Python."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def run_to_exchange(scene: Scene) -> None:
-    """Run ticks until some agent reports: asks for a decision, or has ended."""
+    """Run ticks until some agent reports: requests a decision, or has ended."""
     while not begin_tick(scene):
         finish_tick(scene)
 
@@ -27,7 +24,7 @@ def begin_tick(scene: Scene) -> bool:
     if not scene.started:
         scene.begin_episode(agents.order)
 
-    # Who decides is asked before the counter goes on: Unity's requesters look at the academy's old count.
+    # `decides` is called before the counter moves: Unity's requesters look at the academy's old count.
     decides = scene.decides()
     if decides is True:
         exchange.ask(agents.order)
@@ -36,7 +33,7 @@ def begin_tick(scene: Scene) -> bool:
     scene.counter += 1
     agents.count_tick()
 
-    # The very first tick is an exchange even where nobody is asked: reset() must end.
+    # The very first tick is an exchange even where nobody decides: reset() must end.
     if not exchange.asked.size and not len(scene.records) and scene.started:
         return False
 

@@ -1,7 +1,5 @@
 """What DungeonEscape's agents touch, and what stops them: things, columns, each other, the walls.
 
-In: poses and velocities. Out: touches, changed velocities, shifts out of overlaps. Knows no game rules.
-
 Upright boxes with the contact rules of `ground.py`, found at the start of a tick.
 Legend: N areas, A = 3 agents of an area, S = N * A slots, T = 5 things of an area, K = 7 touches.
 """

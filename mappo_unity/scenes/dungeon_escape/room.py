@@ -1,9 +1,7 @@
 """The bodies of DungeonEscape's areas: where they are, how they move, what they touch.
 
-In: changes of velocity, who is enabled. Out: poses and touches. Knows no rewards, episodes or sensors.
-
 All coordinates are in the axes of the platform: nothing that an agent senses depends on the platform's
-quarter turn, except where the dragon starts. Contacts between agents and things are in `dungeon_contacts.py`.
+quarter turn, except where the dragon starts. Contacts between agents and things are in `contacts.py`.
 Legend: N areas, A = 3 agents of an area, S = N * A slots, T = 5 things of an area, K = 7 touches.
 """
 
@@ -86,7 +84,7 @@ class DungeonRoom:
         self.dragon_speed = np.zeros(num_areas)
         self._dragon_way = np.zeros((num_areas, 2))  # unit vector along x and z
 
-        self._drive = np.zeros((num_slots, 3))  # m/s, asked for in this tick
+        self._drive = np.zeros((num_slots, 3))  # m/s, of this tick
         self._extent = np.zeros(num_slots)  # m: half the agents' width along the room's axes, in this tick
         self._contacts = Contacts(num_areas)
 
@@ -139,7 +137,7 @@ class DungeonRoom:
         self._contacts.refresh(enabled, self.present)
 
     def push(self, ahead: np.ndarray, right: np.ndarray, turn: np.ndarray) -> None:
-        """Turn the agents by `turn` [S] (rad); ask for velocity changes ahead and right [S] (m/s)."""
+        """Turn the agents by `turn` [S] (rad); set velocity changes ahead and right [S] (m/s)."""
         self.yaw += turn
         sin, cos = np.sin(self.yaw), np.cos(self.yaw)
         self._drive[:, 0] = ahead * sin + right * cos

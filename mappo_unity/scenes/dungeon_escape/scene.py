@@ -1,8 +1,7 @@
 """DungeonEscape: kill the dragon with one of three agents, take its key, unlock the door together.
 
 Facts: docs/scenes/DungeonEscape.md. This module holds the rules: who touches what and what follows,
-episodes, groups and observations; bodies are in `dungeon_room.py`, rays in
-`dungeon_sight.py`.
+episodes, groups and observations; bodies are in `room.py`, rays in `sight.py`.
 Legend: N areas, A = 3 agents of an area, S = N * A slots.
 """
 
@@ -72,7 +71,7 @@ class DungeonEscape(Scene):
         self._groups = self.home_groups()
 
     def reset(self) -> None:
-        """Reset every area, then go on as Unity's academy does (Unity leaves the areas as they are)."""
+        """Reset every area, then the academy (whose reset leaves the areas as they are in Unity)."""
         self._check_open()
         self._reset_areas(np.arange(self.num_areas))
         super().reset()
@@ -94,7 +93,7 @@ class DungeonEscape(Scene):
         ]
 
     def act(self, slots: np.ndarray) -> None:
-        """Turn the agents and ask for their changes of velocity."""
+        """Turn the agents and set their changes of velocity."""
         ahead, right, turn = ACTIONS[self.agents.discrete[:, 0]].T  # disabled agents hold action 0
         self.room.push(ahead, right, turn)
 

@@ -1,7 +1,5 @@
 """What DungeonEscape's agents see: one frame of their ray sensor.
 
-In: the bodies of `dungeon_room.py`. Out: observations. Knows no rules.
-
 All rays are horizontal, so upright boxes are cut at the agent's height: rectangles and circles in the plane,
 with the radius of the cast sphere that is left at the gap in height.
 Legend: n agents, R rays, M colliders.

@@ -1,7 +1,4 @@
-"""Where DungeonEscape's agents begin: random spots that no body is near.
-
-In: the bodies of an area. Out: new poses. Knows no rules.
-"""
+"""Where DungeonEscape's agents begin: random spots that no body is near."""
 
 from __future__ import annotations
 

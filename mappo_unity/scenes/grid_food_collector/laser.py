@@ -1,8 +1,8 @@
 """The laser of the food arena: a thick ray that freezes the first agent it meets.
 
-In: poses of all areas. Out: who is hit. Unity casts a sphere of radius 2 m, 25 m straight ahead from the
-middle of the agent; the first collider decides, and what the sphere overlaps at its start is not seen: the
-floor always, the walls (one collider all around) from 2 m, other things from about 2 m.
+Unity casts a sphere of radius 2 m, 25 m straight ahead from the middle of the agent; the first collider
+decides, and what the sphere overlaps at its start is not seen: the floor always, the walls (one collider all
+around) from 2 m, other things from about 2 m.
 
 Legend: N areas, A agents and F balls of an area, S shots. Heights only change how wide a thing is for the
 ray, because the ray is level.

@@ -1,13 +1,11 @@
 """Physics of the food arena: upright boxes (agents) and rolling balls (food) on a floor within four walls.
 
-In: poses and velocities of all areas. Out: the same, one tick later, and which agent touched which ball.
-Knows no rewards. Plain numpy, all areas at once; why no rigid-body engine: fifty free balls an area cost
-MuJoCo three to five times as much, and the doubled friction of boxes needs explicit rules anyway
-(`ground.py`).
+Plain numpy, all areas at once; why no rigid-body engine: fifty free balls an area cost MuJoCo three to five
+times as much, and the doubled friction of boxes needs explicit rules anyway (`ground.py`).
 
 A tick follows Unity's engine: free motion; contacts of the poses at the start (gaps below 0.02 m count);
-inelastic impulses, friction after them (`food_solver.py`); motion; penetrations shrink without leaving a
-velocity behind. Legend: N areas, A agents, F balls of an area, B = N * (A + F) bodies, C contacts. Vectors
+inelastic impulses, friction after them (`solver.py`); motion; penetrations shrink without leaving a velocity
+behind. Legend: N areas, A agents, F balls of an area, B = N * (A + F) bodies, C contacts. Vectors
 are component first, Unity's axes (x right, y up, z forward), metres from the middle of the area's floor.
 """
 
@@ -90,6 +88,7 @@ class FoodPhysics:
         self._solver.separate(contacts, self._position)
         self._position[1, :-1] += push_out(floor_gap)
 
+        # In a touch the one is the ball, the other the agent.
         area, agent = np.divmod(touches.other, self._shape[1])
         return area, agent, touches.one % self._shape[1] - self._num_agents
 
@@ -155,6 +154,7 @@ class FoodPhysics:
         """Find balls at balls."""
         num, circle = self._num_balls, self._circle
         circle[:, :, :num] = self.ball_position[::2]
+        # The first half again: so each ball has the balls that follow it in one window.
         circle[:, :, num:] = circle[:, :, : num // 2]
 
         # A coarse look from above, in single precision: few of all the pairs are near.
@@ -188,6 +188,7 @@ class FoodPhysics:
         offset = self.agent_position[:, :, first] - self.agent_position[:, :, second]
         sizes = self.agent_half[:, first] + self.agent_half[:, second]
         reach = np.sqrt(2) * sizes + CONTACT_GAP
+        # A coarse look from above: boxes lie within the circles through their corners.
         area, pair = np.nonzero(offset[0] ** 2 + offset[2] ** 2 < reach**2)
         if not area.size:
             return NONE

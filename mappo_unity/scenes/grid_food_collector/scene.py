@@ -1,8 +1,8 @@
 """GridFoodCollector: five agents an area collect good food, avoid bad food and freeze each other by laser.
 
-Facts: docs/scenes/GridFoodCollector.md. Contacts: food_physics.py; laser: food_laser.py; observation:
-grid_sensor.py. Legend: N areas, A agents and F foods of an area; slot = area * A + agent. Heights count from
-the floor, which lies 0.5 m above the area's origin in Unity.
+Facts: docs/scenes/GridFoodCollector.md. Contacts: `physics.py`; laser: `laser.py`; observation:
+`grid_sensor.py` of the core. Heights count from the floor, which lies 0.5 m above the area's origin in Unity.
+Legend: N areas, A agents and F foods of an area; slot = area * A + agent.
 """
 
 from __future__ import annotations
@@ -90,6 +90,7 @@ class GridFoodCollector(Scene):
         area, agent = np.divmod(slots, AGENTS)
         physics = self.physics
         place, yaw = physics.agent_position[:, area, agent], physics.agent_yaw[area, agent]
+        # The agent's size spreads the cells of its grid; the cells themselves stay as large.
         scale = 2 * physics.agent_half[area, agent]
         view = grid_sensor.View(place[0], place[2], np.sin(yaw), np.cos(yaw), scale)
 
@@ -136,6 +137,7 @@ class GridFoodCollector(Scene):
 
         if area.size:
             reward = self._food_rewards[food]
+            # An agent may eat several at once, of which an indexed sum would count one.
             self.agents.reward += np.bincount(area * AGENTS + agent, reward, self.num_slots).astype(
                 np.float32
             )

@@ -1,8 +1,7 @@
 """Impulses at contacts of boxes that do not spin and balls that do: all contacts of all areas at once.
 
-In: contacts, velocities. Out: velocities and places after inelastic impulses, friction and push-out. Knows
-neither shapes nor the floor. Contacts are solved side by side in `ROUNDS` rounds; a body's contacts share
-its mass, so that their impulses cannot add up to too much.
+Impulses are inelastic, with friction; penetrations are pushed out. Contacts are solved side by
+side in `ROUNDS` rounds; a body's contacts share its mass, so that their impulses cannot add up to too much.
 Legend: B bodies, C contacts; vectors are component first. Column B stands for walls: it never moves.
 """
 
@@ -117,6 +116,7 @@ class Solver:
         one, other, normal, _, _ = contacts
         mass, inertia = self.inverse_mass, self.inverse_inertia
 
+        # A contact lies on opposite sides of two balls, so their spins add up in the slip.
         slip = velocity[:, one] - velocity[:, other]
         slip -= self.radius * _cross(spin[:, one] + spin[:, other], normal)
         slip -= normal * (slip * normal).sum(axis=0)
@@ -127,6 +127,7 @@ class Solver:
         mobility = share * (mass + self.radius**2 * inertia)
         impulse = np.minimum(speed / (mobility[one] + mobility[other]), limit)
 
+        # Opposite impulses on opposite sides: the torque is the same on both.
         torque = _cross(normal, slip) * (self.radius * impulse)
         slip *= impulse
         _add(velocity, cells, np.concatenate([slip * -mass[one], slip * mass[other]], axis=1))

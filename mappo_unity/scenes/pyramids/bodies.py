@@ -1,8 +1,5 @@
 """Agents, switches and stone pyramids of Pyramids: how agents move and what stops them.
 
-In: changes of velocity. Out: poses, and who touches the switch. Knows no rewards, bricks or
-sensors.
-
 Upright boxes with the contact rules of `ground.py`. Stone pyramids do not give way (a declared
 simplification); a switch stays in its place but turns about the vertical under any push off its centre.
 Legend: N areas, one agent each.
@@ -52,7 +49,7 @@ class PyramidsBodies:
     """Keep agents, switches and stones of all areas in arrays.
 
     Agents: `position`, `velocity` [N, 3] (m, m/s), `yaw` [N] (rad, clockwise from above), `drive` [N, 3]
-    (velocity change asked for this tick). Switches: `switch_position` [N, 3] (the box's centre),
+    (velocity change of this tick). Switches: `switch_position` [N, 3] (the box's centre),
     `switch_fall`, `switch_yaw`, `switch_spin` [N] (m/s, rad, rad/s). `stone_root` [N, 6, 2]: x, z of the
     stone pyramids; `age` int [N]: ticks since the reset, which tells how far they have fallen.
     """
@@ -102,7 +99,7 @@ class PyramidsBodies:
         return np.maximum(SPAWN_Y + STONE_LAYERS[:, 1] - fallen, STONE_LAYERS[:, 6])
 
     def push(self, ahead: np.ndarray, turn: np.ndarray) -> None:
-        """Ask for velocity changes [N] ahead (m/s, in this tick), then turn [N] (rad)."""
+        """Set velocity changes [N] ahead (m/s, in this tick), then turn [N] (rad)."""
         self.drive[:, 0] = ahead * np.sin(self.yaw)
         self.drive[:, 2] = ahead * np.cos(self.yaw)
         self.yaw += turn
@@ -240,6 +237,7 @@ class PyramidsBodies:
         half[:, ::2] = self._half[blocks]
         gap, normal = box_gap(offset, self.yaw[areas], AGENT_HALF, half)
 
+        # Each contact's number among those of its agent: a turn must hold no agent twice.
         first = np.r_[True, areas[1:] != areas[:-1]]
         rank = np.arange(len(areas)) - np.flatnonzero(first)[np.cumsum(first) - 1]
         for number in range(rank.max() + 1):  # an agent in a corner has several: in turns

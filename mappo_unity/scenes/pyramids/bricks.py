@@ -1,8 +1,5 @@
 """The brick pyramid of Pyramids: 25 cubes and the goal on top, which topple, on MuJoCo.
 
-In: where a pyramid appears, what surrounds it, how the agent moves. Out: the cubes' poses, the agent's motion
-among them, and whether it touches the goal. Knows no rewards or episodes.
-
 Each area's pile is in one of four modes: absent; falling, along a recording made once (a pile that falls
 untouched always falls alike); asleep, at rest; awake, stepped by MuJoCo together with its area's agent. It
 wakes when the agent or a turning switch may reach a cube, and sleeps when all cubes are at rest and out of
@@ -134,6 +131,7 @@ class PyramidsBricks:
             return goal
 
         physics = self._physics
+        # the engine moves agents along x and z only: their heading is set, so that nothing spins them
         physics.qpos[areas, 0], physics.qpos[areas, 1] = position[areas, 0], position[areas, 2]
         physics.qpos[areas, 2] = yaw[areas]
         physics.qvel[areas, 0], physics.qvel[areas, 1] = velocity[areas, 0], velocity[areas, 2]
@@ -176,6 +174,7 @@ class PyramidsBricks:
             self.bodies[areas, :, 0] += self.root[areas, :1]
             self.bodies[areas, :, 2] += self.root[areas, 1:]
 
+            # speeds too: a pile that wakes while it falls falls on
             self._speeds[areas] = speeds[tick]
             self.clock[areas] += 1
             self._sleep(areas[tick + 1 == FALL_TICKS])
@@ -239,7 +238,7 @@ def _area_spec() -> mujoco.MjSpec:
     """Return the MuJoCo description of one area: still walls, switch and stones (mocap), agent, pile.
 
     The agent slides without friction on the floor and meets only the pile: all its other contacts are
-    rules of `pyramids_bodies.py`. Its yaw is set, not pushed. The outer walls have no top, so that nothing
+    rules of `bodies.py`. Its yaw is set, not pushed. The outer walls have no top, so that nothing
     leaves the area.
     """
     walls = "".join(_box("", *wall) for wall in INNER_WALLS)

@@ -1,7 +1,7 @@
 """Pyramids: press the switch, find the brick pyramid that appears, topple it and touch the goal on its top.
 
 Facts: docs/scenes/Pyramids.md. This module holds the rules: rewards, episodes, resets, observations; bodies
-are in `pyramids_bodies.py` and `pyramids_bricks.py`, rays in `pyramids_sight.py`.
+are in `bodies.py` and `bricks.py`, rays in `sight.py`.
 Legend: N areas = slots (one agent an area).
 """
 
@@ -74,13 +74,13 @@ class Pyramids(Scene):
         return [*see(self.bodies, self.bricks, self.switch_on, slots), vector]
 
     def act(self, slots: np.ndarray) -> None:
-        """Take the price of a tick, turn the agents and ask for their changes of velocity."""
+        """Take the price of a tick, turn the agents and set their changes of velocity."""
         self.agents.reward -= np.float32(1.0 / self.MAX_STEP)
         ahead, turn = ACTIONS[self.agents.discrete[:, 0]].T
         self.bodies.push(ahead, turn)
 
     def simulate(self) -> None:
-        """Move all bodies by one tick; a touched switch goes on, a touched goal ends the episode."""
+        """Move all bodies by one tick; a touched switch turns on, a touched goal ends the episode."""
         bodies, bricks = self.bodies, self.bricks
         pressed = bodies.solve() & ~self.switch_on
 

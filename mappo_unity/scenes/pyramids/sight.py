@@ -1,7 +1,5 @@
 """What Pyramids' agents see: three ray sensors at three pitches.
 
-In: the bodies of `pyramids_bodies.py` and `pyramids_bricks.py`. Out: observations. Knows no rules.
-
 Legend: n agents, R = 21 rays (seven a sensor), M colliders: still boxes along the axes, switch, cubes.
 """
 

@@ -1,6 +1,5 @@
 """Casts of discs in a plane, all rays of all agents in one go, against discs and one-sided walls.
 
-In: casters, their rays, colliders. Out: how far each ray goes until it meets each collider. Knows no soccer.
 Arrays have their axes in the order (x and z, colliders, rays): NumPy is fastest where the long axis is the
 last one. What depends on the caster only is worked out a caster, then copied to its rays.
 

@@ -1,6 +1,5 @@
 """Contacts of soccer's discs: bounces, friction and push-out, for all fields at once.
 
-In: contacts of pairs of bodies. Out: the bodies' new velocities. Knows no pitch and no rules.
 The method is Unity's engine's (PhysX): projected Gauss-Seidel over the contacts of a field, six iterations;
 contacts that share no body need only one, together.
 Legend: n contacts, M bodies, of which the first F are the balls and the last one (the pitch) never moves.

@@ -1,6 +1,5 @@
 """The bodies of soccer fields as discs on a plane: one tick of all fields at once.
 
-In: velocity changes of the agents, and who kicks. Out: positions, contacts begun, goals. Knows no rules.
 Facts and reasons: docs/scenes/SoccerTwos.md. A tick, as in Unity's engine: forces and drag; contacts that
 exist at the start (gap < 0.02 m) are solved; bodies move, stopped by the pitch (continuous detection; pairs
 of bodies are not swept); then the callbacks: kicks, goals.
@@ -150,6 +149,7 @@ class SoccerPhysics:
         squared = squares[0] + squares[1]
         close = squared < self._reach_squared
 
+        # the first pairs are those of the ball with each agent
         touching = close[: self.num_agents]
         begun = touching > self.touching
         self.touching = touching
@@ -159,6 +159,7 @@ class SoccerPhysics:
             parts.append(self._pairs(close, away, squared))
 
         at = self._flat(position)
+        # mostly known from the end of the last tick
         if self._gaps is None:
             self._gaps = self.pitch.gaps(at, self._radii)
 

@@ -1,6 +1,5 @@
 """The soccer pitch from above: which surface a disc touches, where its way ends, and what is a goal.
 
-In: centres and radii of discs. Out: contacts, ends of ways, goals. Knows no velocities and no rules.
 Facts: docs/scenes/SoccerTwos.md. Axes are Unity's: x towards the purple goal, z to the left of it; metres.
 All faces are one-sided: a disc behind one counts as inside it, however deep, so none is tunnelled.
 The pitch is symmetric, so discs are folded into the corner x, z > 0; there, faces have outward normals.
@@ -200,6 +199,7 @@ class Pitch:
         a, b = _dot(d, d), _dot(m, d)
 
         inside = b * b - a * (_dot(m, m) - (radius - _ROUNDING) ** 2)
+        # on the way there, and the first root within the way
         hit = np.flatnonzero((b < 0) & (inside > 0) & (-b - np.sqrt(np.maximum(inside, 0)) < a))
         if not hit.size:
             return _NOTHING, _NOTHING.gap

@@ -1,7 +1,7 @@
 """SoccerTwos and StrikersVsGoalie: the rules of Unity's soccer scenes.
 
-Facts: docs/scenes/SoccerTwos.md and docs/scenes/StrikersVsGoalie.md. Bodies: soccer_physics.py; what
-agents see: soccer_view.py.
+Facts: docs/scenes/SoccerTwos.md and docs/scenes/StrikersVsGoalie.md. Bodies: `physics.py`; what
+agents see: `view.py`.
 Legend: F fields (areas), A agents of a field, S = F * A slots; slot = field * A + agent.
 """
 
@@ -81,6 +81,7 @@ class SoccerScene(Scene):
         teams = np.array([role.team for role in self.ROLES])
         self._team = np.tile(teams, fields)  # [S]
 
+        # a column for each of the 27 actions of every agent, so that a tick only looks them up
         self._motions = np.concatenate([_motions(role) for role in self.ROLES], axis=1)
         self._motion_offset = np.repeat(27 * np.arange(agents, dtype=np.int32)[:, None], fields, axis=1)
         self._slot = np.arange(self.num_slots).reshape(fields, agents).T.copy()  # [A, F]
@@ -113,6 +114,7 @@ class SoccerScene(Scene):
 
     def act(self, slots: np.ndarray) -> None:
         """Turn the agents; keep their velocity changes and kicks for the physics; reward time."""
+        # the three branches as one number, counted from the columns of the agent's role
         code = self.agents.discrete.dot(_CODE).take(self._slot) + self._motion_offset
         ahead, right, turn, self._kick_power = self._motions.take(code, 1)
 

@@ -1,6 +1,5 @@
 """What soccer's agents see: sphere casts in a plane against ball, agents, walls, nets and posts.
 
-In: the bodies and headings of a field. Out: frames of ray sensors. Knows no rules and no stacks.
 Facts: docs/scenes/SoccerTwos.md. All casts run level at a height of 1 m, so they are casts of a disc of 0.5 m
 among upright shapes: ball and agents, whose centres are 0.5 m lower, are met at sqrt((R + 0.5)^2 - 0.5^2),
 walls at their inner faces and, where these end in the open, at their edges.
@@ -190,6 +189,7 @@ class _Layout:
 
     def __init__(self, counts: Sequence[int], views: Sequence[_Rays], num_columns: int) -> None:
         rays = [len(view.angles) for view in views]
+        # rays stand behavior by behavior, then agent by agent
         behavior = np.repeat(np.arange(len(views)), np.multiply(counts, rays))
 
         numbers = np.array([view.numbers for view in views])[behavior]
@@ -202,6 +202,7 @@ class _Layout:
         self.every = np.arange(len(behavior))
         self.number = numbered(num_columns, len(behavior))
 
+        # a ray's numbers: one for each tag, whether it missed, and last the distance
         self.size = int(numbers.sum())
         self.last = np.cumsum(numbers) - 1
         self.first = self.last - (numbers - 1)

@@ -1,8 +1,6 @@
 """The Walker's body: its 16 parts and 13 driven joints as tables, and the MuJoCo area made from them.
 
-In: nothing. Out: `AREA` descriptions for `AreaPhysics`, the order of parts and joint axes, limits, drives.
 Facts: docs/scenes/Walker.md. Unity's numbers and axes (x right, y up, z forward, metres, kg, degrees).
-Knows neither actions nor rewards.
 """
 
 from __future__ import annotations
@@ -185,6 +183,7 @@ def _add_part(parent: mujoco.MjsBody, part: Part) -> mujoco.MjsBody:
             pos=JOINTS[part.name].anchor,
             axis=[-value for value in axis],
             range=[low, high],
+            # of a drive in full force; `physics` sets it in every tick
             armature=TICK_S * share * (DAMPING + TICK_S * STIFFNESS),
             solref_limit=_SOLREF,
             solimp_limit=_SOLIMP,
@@ -220,6 +219,7 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
     target.add_freejoint(name="target")
     target.add_geom(name="target", type=box, size=[TARGET_HALF] * 3, mass=1, gap=CONTACT_GAP, **_SURFACE)
 
+    # in a contact sensor an XBODY stands for all below it: any part of the figure may touch
     spec.add_sensor(
         name="touched",
         type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -233,6 +233,7 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
 
 def _add_sensors(spec: mujoco.MjSpec) -> None:
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
+    # XBODY is a part's own origin, BODY its centre of mass; `physics` relies on the order
     for kind, frame in (
         (kinds.mjSENS_FRAMEPOS, objects.mjOBJ_XBODY),
         (kinds.mjSENS_FRAMEQUAT, objects.mjOBJ_XBODY),

@@ -1,7 +1,6 @@
 """The Walkers of all areas in motion: drives, poses, velocities and heights above the ground.
 
-In: drive targets by hinge. Out: arrays by area and part, in the order of `walker_body.PARTS`.
-Knows neither actions, rewards nor episodes. Legend: N areas, B = 16 parts, J = 26 hinges.
+Arrays are by area and part, in the order of `body.PARTS`. Legend: N areas, B = 16 parts, J = 26 hinges.
 """
 
 from __future__ import annotations
@@ -65,7 +64,9 @@ class WalkerPhysics:
 
     def __init__(self, num_areas: int, num_threads: int) -> None:
         self._areas = AreaPhysics(body.area(), num_areas, num_threads=num_threads)
+        # Its sensors show joints as poses: they are of the state before a step moves it.
         self._figures = AreaPhysics(body.area(kinematic=True), num_areas, num_threads=num_threads)
+        # Views into the areas' own models: the drives write them in every tick.
         self._armatures = [self._areas.own_model(area)[0].dof_armature[6:32] for area in range(num_areas)]
 
         parts = len(body.PARTS)
@@ -83,6 +84,7 @@ class WalkerPhysics:
 
     def step(self) -> None:
         """Advance one tick, and find all poses."""
+        # Velocities: hips [0:6], hinges [6:32], target [32:38], whose drag acts on its spin only.
         self._areas.qvel[:, :32] *= DRAG_KEPT
         np.clip(self._areas.qvel[:, 3:32], -PART_MAX_SPIN, PART_MAX_SPIN, out=self._areas.qvel[:, 3:32])
         self._areas.qvel[:, 35:38] *= DRAG_KEPT

@@ -4,7 +4,6 @@ The agent is a box that only turns about the vertical, the block slides at a fix
 so all contacts are planes between upright boxes; see `ground.py`. As in Unity, one step of 20 ms with
 discrete collision detection: a fast body may overlap for a few ticks, until it is pushed out at 10 m/s.
 
-In: drives and accelerations by area. Out: places and velocities. Knows nothing of agents or rewards.
 Area coordinates: x right, y up, z forward; metres. Legend: N areas.
 """
 
@@ -72,6 +71,7 @@ class WallJumpBodies:
         velocity *= AGENT_DRAG_KEPT
         self.block_velocity *= BLOCK_DRAG_KEPT
 
+        # contacts are those at the start of the tick, as in Unity's engine
         floor_gap = position[:, 1] - (FLOOR_Y + AGENT_HALF[1])
         self._land(slice(None), floor_gap)
         shift, block_shift = self._contacts(floor_gap)
@@ -112,6 +112,7 @@ class WallJumpBodies:
     def fallen(self) -> np.ndarray:
         """Return where the agent or the block is beyond the floor's edge, bool [N]."""
         x, y, z = self.position.T
+        # who stands on a block that overhangs the edge is not lost
         lost = ~_over_floor(x, z) & ~(self._over_block(x, z, slice(None)) & (y > BLOCK_Y))
         return lost | ~_over_floor(self.block[:, 0], self.block[:, 2])
 
@@ -147,6 +148,7 @@ class WallJumpBodies:
         stuck, stuck_gap, stuck_normal = self._blocks_at_wall()
 
         if not (rows.size or stuck.size):
+            # without a push-out the second one is not looked at
             return None, floor_gap
 
         gap, normal = box_gap(offset, self.yaw[rows], AGENT_HALF, half)
@@ -219,6 +221,7 @@ class WallJumpBodies:
         half = np.empty((rows.size, 3))
         half[walls.size :] = BLOCK_HALF
         half[: walls.size] = WALL_HALF_X, 0.0, WALL_HALF_Z
+        # the wall's middle is at y = 0
         half[: walls.size, 1] = wall_top[walls]
 
         return rows, walls.size, offset, half

@@ -1,7 +1,7 @@
 """WallJump: reach the goal behind a wall of no, small or big height; the big one needs the block.
 
 Facts: docs/scenes/WallJump.md. One agent an area; the wall's height of each episode decides whether the agent
-asks as SmallWallJump or as BigWallJump. Bodies: `wall_jump_bodies.py`. Legend: N areas = slots.
+requests decisions as SmallWallJump or as BigWallJump. Bodies: `bodies.py`. Legend: N areas = slots.
 """
 
 from __future__ import annotations
@@ -211,6 +211,7 @@ class WallJump(Scene):
     def _steer_jumps(self, slots: np.ndarray, direction: np.ndarray) -> None:
         """Move velocities towards the jump's target, at once; the drive is added by the physics step."""
         bodies = self.bodies
+        # horizontally the target moves along with the agent's own drive
         way = direction[slots]
         way[:, 1] = self.jump_start_y[slots] + JUMP_HEIGHT - bodies.position[slots, 1]
 

@@ -1,7 +1,7 @@
 """The two ray sensors of WallJump: level at the agent's height, and upward from above it.
 
-In: where agents, blocks and walls are. Out: one frame of each sensor. The floor (not a listed tag) and what
-an agent stands on are not seen. Area coordinates: x right, y up, z forward; metres.
+The floor (not a listed tag) and what an agent stands on are not seen. Area coordinates: x right, y up,
+z forward; metres.
 """
 
 from __future__ import annotations
