@@ -20,7 +20,7 @@ def slot_shape(behavior: BehaviorState) -> torch.Size:
 def root_entries(behavior: BehaviorState) -> TensorDict:
     """Return what the agents are to act on now: entries as `reset` gives them, ends all False."""
     shape = slot_shape(behavior)
-    # copies, because the behavior goes on writing into its newest observations
+    # copies, because the behavior keeps writing into its newest observations
     entries = _observe(behavior, [o.copy() for o in behavior.obs])
 
     for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
@@ -53,6 +53,7 @@ def _observe(behavior: BehaviorState, observations: list[np.ndarray]) -> dict[st
         for i, o in enumerate(observations)
     }
 
+    # copies, because flags are written in place in later rounds
     for key, flags in (
         (keys.ACTING, behavior.acting),
         (keys.PRESENT, behavior.present),

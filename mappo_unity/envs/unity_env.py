@@ -78,7 +78,7 @@ class UnityEnv(EnvBase):
         specs = make_specs(self._behaviors, self.entry_of, self.action_limit)
         self.observation_spec, self.action_spec, self.reward_spec, self.done_spec = specs
 
-    # --- what a trainer asks for beyond EnvBase
+    # --- what a trainer needs beyond EnvBase
 
     sides: dict[str, list[str]]  # behaviors of every policy name
     entry_of: dict[str, str]  # behavior -> TensorDict entry: the policy name where it has one side only
@@ -249,6 +249,7 @@ class UnityEnv(EnvBase):
         self._checks = {name: seen.check for name, seen in first.items()}
 
         for name, sizes in team_sizes(first).items():
+            # in the order of `_limits`; a limit of the options wins over what is seen
             teams, members = (limit or seen for limit, seen in zip(self._limits, sizes))
             table = SlotTable(name, teams, members)
             behavior = BehaviorState(name, self._specs[name], table, self.death_masking)

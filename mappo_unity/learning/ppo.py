@@ -194,6 +194,7 @@ class PolicyLearner:
 
             # one look at the KL an epoch: every look waits for the device
             kl_epoch = float(torch.stack(kls).mean())
+            # beyond max_kl the update is taken back below, beyond target_kl it only ends early
             if not math.isfinite(kl_epoch) or kl_epoch > self.cfg.max_kl:
                 break
             if self.cfg.target_kl is not None and kl_epoch > self.cfg.target_kl:

@@ -60,6 +60,7 @@ class MatchSeries:
         policy = ActorPolicy(layout, actors, False, "the policy")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(cfg.seed + agent_steps)
+            # a folder of its own: the run's players log under the same names
             make_env = make_env_function(cfg.env, self._folder / PLAYERS / "matches")
             seed = (cfg.seed + agent_steps) % 2**31
             scores = play_matches(make_env, policy, RandomPolicy(seed), cfg.matches.count, seed)

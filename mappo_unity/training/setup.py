@@ -185,6 +185,7 @@ def make_learners(
     for name, sides in env.sides.items():
         model, ppo = behavior_config(cfg, name)
         behavior = env.behaviors[sides[0]]
+        # sides that share a policy are stacked: all their teams are rows of its batch
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
         check_minibatches(name, ppo, rounds, teams, team_size, note)
 

@@ -79,9 +79,8 @@ def train(
                 except BaseException as error:
                     with stop.ignored():
                         saver.rescue(log.message_if_possible)
-                    # with a checkpoint an interrupted run can be resumed: it has an outcome like any other
                     if not isinstance(error, Interrupted) or saver.last is None:
-                        raise
+                        raise  # an interrupted run has an outcome only where it can be resumed
                     status = INTERRUPTED
             return _outcome(status, state, saver, stop)
 
