@@ -1,7 +1,4 @@
-"""Play episodes of a BaseEnv with fixed policies and sum up what they earn.
-
-In: a BaseEnv and a policy for each behavior. Out: finished episodes, and figures as a dict.
-"""
+"""Play episodes of a BaseEnv with fixed policies, and sum up what they earn."""
 
 from __future__ import annotations
 
@@ -33,13 +30,13 @@ def play(
         The episodes of every behavior, in the order of their ends.
 
     Raises:
-        EnvironmentDataError: the environment sent what breaks its contract, or nobody asks any more.
+        EnvironmentDataError: the environment breaks its contract, or nobody requests decisions any more.
         EnvironmentFailure: so many episodes do not end.
     """
     running: dict[tuple[str, int], list[float]] = {}
     counts = _Counts(episodes)
     checks: dict[str, RecordCheck] = {}
-    silent = 0  # steps in a row in which nobody asked
+    silent = 0  # steps in a row in which nobody requested a decision
 
     env.reset()
     check_specs(env.behavior_specs)
@@ -104,6 +101,7 @@ def _end_episodes(name: str, terminal: Any, running: dict, counts: _Counts) -> N
         if episode is None:
             continue
 
+        # The last reward comes with the end, and belongs to the episode.
         counted, individual, group, length = episode
         individual, group = (
             individual + float(terminal.reward[row]),

@@ -1,9 +1,7 @@
 """An actor as the ONNX graph that Unity's Agent plays: ML-Agents model format 3.
 
-In: an `Actor`, the shapes of its sensors. Out: an onnx ModelProto. Built node by node, not traced:
-the graph has the operators, names and shapes of the files that ML-Agents itself writes (opset 9,
-which Sentis and the Inference Engine import), whatever torch's own exporter does. Knows nothing of
-checkpoints and files.
+It is built node by node, not traced: it has the operators, names and shapes of the files that ML-Agents
+itself writes (opset 9, which Sentis and the Inference Engine import), whatever torch's own exporter does.
 
     inputs   obs_0 ... obs_n  float32 [batch, size] or [batch, C, H, W], in the order of the sensors
              action_masks     float32 [batch, sum of branches], 1 = allowed; only with branches
@@ -58,6 +56,7 @@ def build_model(
     graph.tell("version_number", [FORMAT], [1])
     graph.tell("memory_size", [0.0], [1])
 
+    # The last layer gives all actions at once; the graph has one of its own for each kind.
     *body, head = network.net
     if not isinstance(head, nn.Linear):
         raise ExportError(f"the policy network ends in {with_article(type(head).__name__)}, not in a Linear")
@@ -158,7 +157,7 @@ def _conv(graph: _Graph, layer: Any, x: str, name: str) -> str:
         raise ExportError(f"layer {name}: only plain convolutions (one group, zero padding) can be exported")
     inputs = [x, graph.constant(f"{name}.weight", layer.weight), graph.constant(f"{name}.bias", layer.bias)]
     sizes = {"kernel_shape": layer.kernel_size, "strides": layer.stride, "dilations": layer.dilation}
-    return graph.node("Conv", inputs, pads=[*layer.padding, *layer.padding], group=1, **sizes)
+    return graph.node("Conv", inputs, pads=[*layer.padding, *layer.padding], group=1, **sizes)  # begins, ends
 
 
 _LAYERS: dict[str, Callable[[_Graph, Any, str, str], str]] = {
@@ -221,7 +220,7 @@ def _continuous_head(graph: _Graph, hidden: str, head: nn.Linear, log_std: Tenso
     """Add ``clip(mean + std * N(0, 1), +-3) / 3``, and the same without the noise."""
     mean = graph.gemm(hidden, head.weight[:size], head.bias[:size], "mean")
     std = log_std.detach().clamp(*LOG_STD_RANGE).exp()[None]
-    noise = graph.node("RandomNormalLike", [mean], dtype=1)
+    noise = graph.node("RandomNormalLike", [mean], dtype=1)  # float32
     sample = graph.node("Add", [mean, graph.node("Mul", [noise, graph.constant("std", std)])])
     limit = graph.constant("limit", CONTINUOUS_LIMIT)
 
@@ -237,6 +236,7 @@ def _continuous_head(graph: _Graph, hidden: str, head: nn.Linear, log_std: Tenso
 def _discrete_heads(graph: _Graph, hidden: str, head: nn.Linear, layout: ActionLayout) -> None:
     """Add a draw and the mode of every branch."""
     masks = graph.input("action_masks", [sum(layout.branches)])
+    # `_categorical` takes these by name, for every branch.
     graph.constant("one", 1.0)
     graph.constant("forbidden", FORBIDDEN)
     weight, bias = head.weight[layout.continuous :], head.bias[layout.continuous :]
@@ -296,5 +296,5 @@ def _categorical(graph: _Graph, logits: str, mask: str) -> tuple[str, str]:
     penalty = graph.node("Mul", [graph.node("Sub", ["one", mask]), "forbidden"])
     masked = graph.node("Sub", [graph.node("Mul", [logits, mask]), penalty])
     probs = graph.node("Softmax", [masked], axis=1)
-    draw = graph.node("Multinomial", [graph.node("Log", [probs])], dtype=7, sample_size=1)
+    draw = graph.node("Multinomial", [graph.node("Log", [probs])], dtype=7, sample_size=1)  # int64
     return draw, graph.node("ArgMax", [probs], axis=1, keepdims=1)

@@ -1,7 +1,5 @@
 """ONNX files as policies: our own exports and those of ML-Agents (model formats 2 and 3).
 
-In: a file, the records of a BaseEnv. Out: ActionTuples. Knows nothing of checkpoints or torch.
-
 Format 3 has an input for each sensor (``obs_i``) and gives branch indices; format 2 has all vectors
 in one (``vector_observation``) and gives log-probabilities, from which branches are drawn here.
 Recurrent files get each agent's memory back until its episode ends.
@@ -69,6 +67,7 @@ class OnnxPolicy:
             action.add_continuous(out[self._output("continuous_actions")].astype(np.float32))
 
         if branches:
+            # Format 2 gives log-probabilities, format 3 indices: the type tells them apart.
             chosen = out[self._output("discrete_actions")]
             chosen = self._draw(chosen, branches) if np.issubdtype(chosen.dtype, np.floating) else chosen
             action.add_discrete(chosen.astype(np.int32))
@@ -82,6 +81,7 @@ class OnnxPolicy:
 
     def check(self, behavior: str, spec: BehaviorSpec) -> None:
         """Raise ConfigError if this file cannot play that behavior."""
+        # Called with every step: what fitted once is not compared again.
         if behavior in self._fits:
             return
         name = self.metadata.get("behavior_name")

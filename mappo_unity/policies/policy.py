@@ -1,7 +1,4 @@
-"""Things that act on DecisionSteps: a trained checkpoint, or chance.
-
-In: the records of a BaseEnv. Out: ActionTuples. Used to play, not to learn.
-"""
+"""Policies that act on DecisionSteps: a trained checkpoint, or chance."""
 
 from __future__ import annotations
 
@@ -145,7 +142,7 @@ class Places(NamedTuple):
 def team_places(group_id: np.ndarray, team_size: int) -> Places:
     """Give each row its team and its place in it: the order of the rows of a group.
 
-    Members that are not asked at the same time are not told apart by this; it matters only to
+    Members that do not request decisions at the same time are not told apart by this; it matters only to
     policies with a network for each member.
     """
     # Group 0 is none: each of its agents is a team of its own, numbered after the groups.

@@ -1,7 +1,4 @@
-"""What mappo-play does: show a policy in its embedded scene, in a video file or in a window.
-
-In: `PlayConfig`. Out: a video, and what was played as a dict. Prints nothing, learns nothing.
-"""
+"""What mappo-play does: show a policy in its embedded scene, in a video file or in a window."""
 
 from __future__ import annotations
 
