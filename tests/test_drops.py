@@ -57,6 +57,12 @@ def test_rows_of_an_episode_reach_back_to_the_one_before() -> None:
     assert episode_rows(done, 4, torch.tensor([True, True]))[:, 1].tolist() == [True] * 5 + [False]
 
 
+def test_slots_follow_the_batch_to_its_device() -> None:
+    # tensors on "meta" mix with those on the CPU as little as those on a GPU do
+    done = torch.zeros(6, 2, dtype=torch.bool, device="meta")
+    assert episode_rows(done, 4, torch.tensor([True, False])).device == done.device
+
+
 def test_a_cut_episode_neither_counts_nor_is_learned_from() -> None:
     # Agent 0 ends by itself in result 1; the player fails in result 3 and takes both agents' episodes along.
     script = [

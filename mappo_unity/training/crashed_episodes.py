@@ -50,7 +50,7 @@ def episode_rows(done_T: Tensor, last: int, slots: Tensor) -> Tensor:
         slots: bool ``[...]``, whose episodes are meant.
     """
     rows = torch.zeros_like(done_T)
-    playing = slots.clone()
+    playing = slots.to(done_T.device, copy=True)  # slots come from numpy, the batch may lie on a GPU
 
     # Backwards from the end, until a row in which the episode before it ended.
     for t in range(last, -1, -1):

@@ -58,7 +58,9 @@ class MatchSeries:
         """Play a series and return its figures; the random numbers of training stay untouched."""
         cfg = self._cfg
         policy = ActorPolicy(layout, actors, False, "the policy")
-        with torch.random.fork_rng(devices=[]):
+        # `torch.manual_seed` seeds the GPU, too, where the policy draws its actions
+        cuda = [torch.device(cfg.device)] if cfg.device.startswith("cuda") else []
+        with torch.random.fork_rng(devices=cuda):
             torch.manual_seed(cfg.seed + agent_steps)
             # a folder of its own: the run's players log under the same names
             make_env = make_env_function(cfg.env, self._folder / PLAYERS / "matches")
