@@ -189,6 +189,13 @@ def test_popart_moves_the_statistics_and_leaves_the_values(kind, hidden, share):
     assert torch.allclose(before, after, rtol=1e-4, atol=1e-2)
 
 
+def test_a_step_leaves_the_deviations_in_their_range():
+    learner = make_learner(model={"init_log_std": 2}, lr=0.5, entropy_coef=10.0, max_kl=1e9)
+    learner.learn(make_batch(learner), 0.0)
+    log_std = learner.actor[0].module.log_std.detach()
+    assert float(log_std.max()) == 2 and learner.rollbacks == 0
+
+
 def test_departed_members_train_the_critic_and_not_the_policy():
     learner = make_learner(death_masking=True)
     acting = torch.ones(T, G, A, 1, dtype=torch.bool)

@@ -19,6 +19,7 @@ from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
 from mappo_unity.config.schema import Optimizer, PPOConfig, ValueNormKind
+from mappo_unity.learning.actor_critic import project
 from mappo_unity.learning.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
 from mappo_unity.learning.critics import Critic
 from mappo_unity.learning.encoders import RunningNorm
@@ -223,6 +224,7 @@ class PolicyLearner:
         total.backward()
         grad_norm = nn.utils.clip_grad_norm_(self.params, self.cfg.max_grad_norm, foreach=True)
         self.optimizer.step()
+        project(self.actor)
 
         with torch.no_grad():
             mask, log_ratio = minibatch.get(ACTOR_LEARNS), self.loss.log_ratio
