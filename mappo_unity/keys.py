@@ -20,6 +20,7 @@ MASK = "action_mask"  # bool [..., A, sum of branches]: True = allowed (Unity's 
 ACTING = "acting"  # bool [..., A, 1]: the agent requested a decision in this round
 PRESENT = "present"  # bool [..., A, 1]: an agent holds the slot (or held it and departed)
 DEPARTED = "departed"  # bool [..., A, 1]: the agent ended for good while its team plays on
+FIRST = "is_init"  # bool [..., A, 1]: the decision requested is the first of its agent's episode
 REWARD = "reward"  # float32 [..., A, 1]: individual reward that arrived in this round
 GROUP_REWARD = "group_reward"  # float32 [..., A, 1]: reward of the agent's team, likewise
 DONE = "done"  # bool [..., A, 1]: terminated or truncated

@@ -7,7 +7,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from mappo_unity.config.schema import Activation, ModelConfig, PPOConfig, Schedule, ValueLoss, ValueNormKind
+from mappo_unity.config.schema import (
+    Activation,
+    CriticKind,
+    ModelConfig,
+    PPOConfig,
+    Schedule,
+    ValueLoss,
+    ValueNormKind,
+)
 from mappo_unity.learning.actor_critic import make_actor, make_critic
 from mappo_unity.learning.distributions import ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
@@ -18,9 +26,9 @@ T, G, A, OBS = 12, 5, 2, 3
 TWO_CONTINUOUS = ActionLayout(2, ())
 
 
-def make_learner(layout=TWO_CONTINUOUS, **options):
+def make_learner(layout=TWO_CONTINUOUS, model=None, **options):
     torch.manual_seed(0)
-    model = ModelConfig(hidden=[16], activation=Activation.tanh)
+    model = ModelConfig(**{"hidden": [16], "activation": Activation.tanh} | (model or {}))
     cfg = PPOConfig(**({"minibatch_size": 40} | options))
     obs = ObsLayout(OBS)
     return PolicyLearner(make_actor(obs, layout, A, model), make_critic(obs, A, model), cfg, T * G, A)
@@ -33,10 +41,8 @@ def make_batch(learner, acting=None):
         {"observation": torch.randn(*shape, OBS) * 4 + 1, "acting": flags if acting is None else acting},
         shape,
     )
-    if learner.actor[0].module.layout.branches:
-        batch["action_mask"] = torch.ones(
-            *shape, sum(learner.actor[0].module.layout.branches), dtype=torch.bool
-        )
+    if learner.actor.layout.branches:
+        batch["action_mask"] = torch.ones(*shape, sum(learner.actor.layout.branches), dtype=torch.bool)
     with torch.no_grad():
         out = learner.actor(batch.clone())
     batch["action"], batch["action_log_prob"] = out["action"], out["action_log_prob"]
@@ -167,8 +173,13 @@ def test_state_goes_on_to_the_bit():
     assert one.value_norm.statistics() == two.value_norm.statistics()
 
 
-def test_popart_moves_the_statistics_and_leaves_the_values():
-    learner = make_learner(normalize_values=ValueNormKind.popart)
+@pytest.mark.parametrize("share", [True, False])
+@pytest.mark.parametrize("kind", list(CriticKind))
+@pytest.mark.parametrize("hidden", [[16], [1], [4, 1, 1]])
+def test_popart_moves_the_statistics_and_leaves_the_values(kind, hidden, share):
+    model = {"critic": kind, "critic_hidden": hidden, "share_parameters": share}
+    learner = make_learner(model=model, normalize_values=ValueNormKind.popart)
+    assert len(learner.value_layers) == (1 if share else A)
     batch = make_batch(learner)
     learner._move_value_norm(torch.randn(100) * 5 + 30)
     before = learner._values(batch)
@@ -176,6 +187,13 @@ def test_popart_moves_the_statistics_and_leaves_the_values():
     after = learner._values(batch)
     assert learner.value_norm.statistics()[0] < -100
     assert torch.allclose(before, after, rtol=1e-4, atol=1e-2)
+
+
+def test_a_step_leaves_the_deviations_in_their_range():
+    learner = make_learner(model={"init_log_std": 2}, lr=0.5, entropy_coef=10.0, max_kl=1e9)
+    learner.learn(make_batch(learner), 0.0)
+    log_std = learner.actor[0].module.log_std.detach()
+    assert float(log_std.max()) == 2 and learner.rollbacks == 0
 
 
 def test_departed_members_train_the_critic_and_not_the_policy():

@@ -52,6 +52,7 @@ class BehaviorState:
         self.mask = np.ones((count, sum(self.spec.action_spec.discrete_branches)), bool)
 
         self.acting = np.zeros(count, bool)
+        self.first = np.zeros(count, bool)
         self.present = np.zeros(count, bool)
         self.departed = np.zeros(count, bool)
         self.order = np.zeros(0, np.int64)  # slots in the order of the last DecisionSteps
@@ -72,6 +73,7 @@ class BehaviorState:
         self.terminated = np.zeros(count, bool)
         self.truncated = np.zeros(count, bool)
         self.acting = np.zeros(count, bool)
+        self.first = np.zeros(count, bool)  # acting, and the first decision of its agent's episode
         self.crashed = np.zeros(count, bool)  # slots whose episode `mark_crashed` named in this round
         self.order = np.zeros(0, np.int64)
         self._terminal_obs: list[tuple[np.ndarray, list[np.ndarray]]] = []
@@ -208,6 +210,7 @@ class BehaviorState:
             self.mask[slots] = True if masks is None else ~np.concatenate(masks, axis=1)
 
         self.acting[slots] = True
+        self.first[slots] = self.length[slots] == 1
         self.order = slots
 
     def _finish_episodes(
@@ -256,7 +259,7 @@ class BehaviorState:
         self.group_reward[departed] += share[departed // self.slots.team_size]
 
     _ARRAYS = (
-        *("acting", "present", "departed", "order", "mask"),
+        *("acting", "first", "present", "departed", "order", "mask"),
         *("individual_return", "group_return", "length"),
     )
 
@@ -267,6 +270,8 @@ class BehaviorState:
 
     def set_state(self, state: dict) -> None:
         """Go back to a state that `get_state` returned."""
+        # older snapshots do not say whose decision is the first of an episode
+        state = {"first": state["acting"] & (state["length"] == 1)} | state
         for name in self._ARRAYS:
             setattr(self, name, np.array(state[name], getattr(self, name).dtype))
         self.obs = [np.array(o, np.float32) for o in state["obs"]]

@@ -27,7 +27,7 @@ def make_specs(
             keys.SENSOR.format(i): Unbounded((*shape, *o.shape[1:]))
             for i, o in enumerate(behavior.obs)
         }
-        for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED):
+        for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED, keys.FIRST):
             entries[key] = Binary(1, (*shape, 1), dtype=torch.bool)
 
         # without discrete actions there is nothing to mask

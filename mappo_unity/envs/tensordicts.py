@@ -58,6 +58,7 @@ def _observe(behavior: BehaviorState, observations: list[np.ndarray]) -> dict[st
         (keys.ACTING, behavior.acting),
         (keys.PRESENT, behavior.present),
         (keys.DEPARTED, behavior.departed),
+        (keys.FIRST, behavior.first),
     ):
         entries[key] = torch.from_numpy(flags.reshape(*shape, 1).copy())
 

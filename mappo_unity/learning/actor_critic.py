@@ -16,13 +16,11 @@ from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
-from mappo_unity.config.schema import CriticKind, ModelConfig
+from mappo_unity.config.schema import LOG_STD_RANGE, CriticKind, ModelConfig
 from mappo_unity.learning.critics import CentralCritic, LocalCritic, PooledCritic
 from mappo_unity.learning.distributions import ActionDistribution, ActionLayout
 from mappo_unity.learning.encoders import Encoder, ObsLayout
 from mappo_unity.learning.mlp import make_mlp
-
-LOG_STD_RANGE = (-5.0, 2.0)
 
 
 class Actor(nn.Module):
@@ -48,11 +46,21 @@ class Actor(nn.Module):
             return out
 
         # means, logarithms of deviations, logits: the order that `ActionDistribution` reads
-        log_std = self.log_std.clamp(*LOG_STD_RANGE).expand(*out.shape[:-1], size)
+        log_std = self._bounded_log_std().expand(*out.shape[:-1], size)
         if not self.layout.branches:
             return torch.cat([out, log_std], -1)
 
         return torch.cat([out[..., :size], log_std, out[..., size:]], -1)
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """Take the deviations back into their range, after a step of the optimizer."""
+        self.log_std.clamp_(*LOG_STD_RANGE)
+
+    def _bounded_log_std(self) -> Tensor:
+        bounded = self.log_std.clamp(*LOG_STD_RANGE).detach()
+        # `clamp` itself has no gradient outside its range: a deviation there could never come back
+        return bounded + (self.log_std - self.log_std.detach())
 
 
 class PerMember(nn.Module):
@@ -119,6 +127,13 @@ class UnityActor(ProbabilisticActor):
             dist = ActionDistribution(params, self.layout, mask)
             action = dist.sample()
             return action, dist.log_prob(action)
+
+
+def project(policy: nn.Module) -> None:
+    """Take the deviations of all actors of a policy back into their range."""
+    for module in policy.modules():
+        if isinstance(module, Actor):
+            module.project()
 
 
 def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig) -> UnityActor:

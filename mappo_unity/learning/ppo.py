@@ -19,7 +19,9 @@ from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
 from mappo_unity.config.schema import Optimizer, PPOConfig, ValueNormKind
+from mappo_unity.learning.actor_critic import project
 from mappo_unity.learning.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
+from mappo_unity.learning.critics import Critic
 from mappo_unity.learning.encoders import RunningNorm
 from mappo_unity.learning.loss import ACTOR_LEARNS, CRITIC_LEARNS, MaskedClipPPOLoss
 from mappo_unity.learning.value_norm import ValueNorm
@@ -50,8 +52,7 @@ class PolicyLearner:
         self.value_norm = ValueNorm(cfg.value_norm_beta, cfg.normalize_values is not ValueNormKind.none)
 
         self.critic_keys = [str(key) for key in critic.in_keys]
-        # the layers that give values, which PopArt rescales
-        self.value_layers = [m for m in critic.modules() if isinstance(m, nn.Linear) and m.out_features == 1]
+        self.value_layers = [m.head for m in critic.modules() if isinstance(m, Critic)]
         inputs = [*(str(key) for key in actor.in_keys), *self.critic_keys]
         self.row_keys = list(dict.fromkeys([*inputs, keys.ACTION, keys.LOG_PROB]))
 
@@ -224,6 +225,7 @@ class PolicyLearner:
         total.backward()
         grad_norm = nn.utils.clip_grad_norm_(self.params, self.cfg.max_grad_norm, foreach=True)
         self.optimizer.step()
+        project(self.actor)
 
         with torch.no_grad():
             mask, log_ratio = minibatch.get(ACTOR_LEARNS), self.loss.log_ratio

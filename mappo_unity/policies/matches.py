@@ -134,8 +134,8 @@ def count(episodes: list[Episode], grouped: bool) -> Score:
     return score
 
 
-def wilson(wins: int, total: int) -> tuple[float, float]:
-    """Return Wilson's 95 % confidence interval of a share (Wilson 1927)."""
+def wilson(wins: float, total: int) -> tuple[float, float]:
+    """Return Wilson's 95 % confidence interval of a share (Wilson 1927); a draw may count as half a win."""
     if not total:
         return math.nan, math.nan
     share, z2 = wins / total, Z95**2

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity import keys
-from mappo_unity.config.schema import ModelConfig
+from mappo_unity.config.schema import ModelConfig, bounded_log_std
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.actor_critic import make_actor
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
@@ -204,6 +204,8 @@ def _actor(state: dict[str, Any], name: str) -> Any:
 def model_from_saved(saved: dict[str, Any]) -> ModelConfig:
     """Return the model options that a checkpoint holds; those that it does not know have their defaults."""
     known = {field.name: saved[field.name] for field in fields(ModelConfig) if field.name in saved}
+    if "init_log_std" in known:
+        known["init_log_std"] = bounded_log_std(known["init_log_std"])
     model = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ModelConfig), known))
     assert isinstance(model, ModelConfig)
     return model

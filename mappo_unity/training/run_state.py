@@ -158,6 +158,7 @@ class RunState:
         self.matches.load_state_dict(state["matches"])
         for name in _COUNTERS:
             setattr(self, name, state[name])
+        self.best_score = self.matches.comparable(self.best_score, state["matches"])
 
         # checkpoints of older versions hold no samples
         self.samples = state.get("samples", {})
