@@ -1,7 +1,7 @@
 """A batch of rounds seen as decisions: what followed each one, and whether that has arrived.
 
 An environment is played in rounds, in which not every agent is asked. Learning looks at an agent's own
-decisions: a decision's outcome is the reward of all rounds up to the agent's next decision or its end, and the
+decisions: the outcome of one is the reward of all rounds up to the agent's next decision or its end, and the
 value that stands there. `DecisionView` finds these once for a batch, for all slots side by side; advantages,
 memory and other reward signals read it. A decision whose outcome had not arrived when the batch ended is
 *pending*: it is carried into the next batch (`learning.carried`).
