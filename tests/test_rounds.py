@@ -205,3 +205,44 @@ def test_next_equals_the_following_root_where_no_episode_ended(name):
         assert same.any()
         for key in (*("acting", "present", "departed", "is_init", "action_mask"), "obs_0"):
             assert torch.equal(following[key][same], rows[behavior][1:][key][same]), key
+
+
+# --- departed members whose team is cut off
+
+
+@pytest.mark.parametrize(
+    ("last", "expected"),
+    [((CUT, CUT), CUT), ((END, END), END), ((CUT, END), CUT)],
+)
+def test_departed_members_end_as_the_last_of_their_team(last, expected):
+    env = open_env(
+        [
+            [one(0), one(1), one(2)],
+            [one(0, ends=END), one(1), one(2)],
+            [one(1, ends=last[0]), one(2, ends=last[1]), one(0, obs=3), one(1), one(2)],
+        ]
+    )
+    rows = play(env, 2)
+    assert read(rows, "next", "truncated") == [[False] * 3, [expected == CUT, *(end == CUT for end in last)]]
+    assert read(rows, "next", "terminated") == [[False] * 3, [expected == END, *(end == END for end in last)]]
+    assert read(rows, "next", "departed")[1] == [True, False, False]
+    assert read(rows, "next", "obs_0")[1] == [0, 0, 0]
+    # its own episode was a real end
+    assert [episode.interrupted for episode in env.pop_episodes()["Fake?team=0"]] == [
+        *(False, last[0] == CUT, last[1] == CUT)
+    ]
+
+
+def test_departed_members_go_on_while_one_of_their_team_is_left():
+    env = open_env(
+        [
+            [one(0), one(1), one(2)],
+            [one(0, ends=END), one(1), one(2)],
+            [one(1, ends=CUT), one(2, group_reward=1)],
+            [one(2, ends=CUT, group_reward=2), one(0)],
+        ]
+    )
+    rows = play(env, 3)
+    assert [row[0] for row in read(rows, "next", "truncated")] == [False, False, True]
+    assert [row[0] for row in read(rows, "next", "departed")] == [True, True, True]
+    assert not rows["next", "Fake", "terminated"].any()

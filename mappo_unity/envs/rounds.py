@@ -167,7 +167,7 @@ class BehaviorState:
         self._ends.playing(ends, [o[over] for o in observations])
 
         if self.slots.team_size > 1 and np.count_nonzero(plays_on) < len(rows):
-            self._end_teams(rows[~plays_on])
+            self._end_teams(rows[~plays_on], interrupted[~plays_on])
 
     def _add_decision(self, decision: DecisionSteps) -> None:
         slots = self.slots.assign(decision.agent_id, decision.group_id)
@@ -220,15 +220,17 @@ class BehaviorState:
             self.terminated[rows] = True
             self._ends.returning(rows, self._shapes)
 
-    def _end_teams(self, rows: np.ndarray) -> None:
-        """Members that departed earlier end with their team; `rows` were its last members."""
+    def _end_teams(self, rows: np.ndarray, interrupted: np.ndarray) -> None:
+        """Members that departed earlier end with their team's last members `rows`, and as these do."""
         size = self.slots.team_size
-        over = np.zeros(self.slots.num_teams, bool)
+        over, cut = np.zeros((2, self.slots.num_teams), bool)
         over[rows // size] = True
+        cut[rows[interrupted] // size] = True
 
         departed = np.flatnonzero(self.departed & np.repeat(over, size))
         if len(departed):
-            self.terminated[departed] = True
+            self.truncated[departed] = cut[departed // size]
+            self.terminated[departed] = ~cut[departed // size]
             self.departed[departed] = False
             self.present[departed] = False
             self._ends.departed(departed, self._shapes)
