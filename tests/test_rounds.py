@@ -1,11 +1,16 @@
 """What the rows of a round say of episodes: first decisions, ends, team mates that departed, moves."""
 
+import pytest
 import torch
 from fakes import Record as R
 from fakes import ScriptedEnv, behavior_spec
 
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.learning.advantage import masked_gae
+from mappo_unity.learning.critics import seen_features
+from mappo_unity.learning.ppo import has_value
+from mappo_unity.scenes import make_scene
 
 END, CUT = "terminated", "interrupted"
 
@@ -104,3 +109,140 @@ def test_a_snapshot_knows_first_decisions_and_an_older_one_still_loads():
         other = UnityEnv(lambda seed: Snapshots(script))
         other.set_state(state)
         assert read(other.reset().unsqueeze(0), "is_init") == [[True, False]]
+
+
+# --- what `next` says of an episode that ended
+
+
+def cut_team(then):
+    """A team of three that loses one member and is then cut off, beside a team of one."""
+    return [
+        [one(0, obs=1), one(1, obs=2), one(2, obs=3), two(9)],
+        [one(0, obs=9, ends=END), one(1, obs=4), one(2, obs=5), two(9)],
+        [one(1, obs=6, ends=CUT), one(2, obs=7, ends=CUT), *then, two(9)],
+        [one(10), one(11), one(12), two(9)],
+    ]
+
+
+@pytest.mark.parametrize("then", [[], [one(10, obs=8), one(11, obs=8), one(12, obs=8)]])
+def test_a_team_that_was_cut_off_is_seen_as_it_was(then):
+    rows = play(open_env(cut_team(then)), 3)
+    assert read(rows, "next", "present")[1] == [True, True, True, True, False, False]
+    assert read(rows, "next", "departed")[1] == [True, False, False, False, False, False]
+    assert read(rows, "next", "obs_0")[1][:3] == [0, 6, 7]
+    assert read(rows, "next", "done")[1] == [True, True, True, False, False, False]
+    # the root says who is there now
+    assert read(rows, "present")[2][:3] == [bool(then)] * 3
+    assert not then or read(rows, "obs_0")[2][:3] == [8, 8, 8]
+    assert not rows["Fake", "departed"][2].any()
+
+    inputs = (rows["next", "Fake", key][1, 0] for key in ("obs_0", "present", "departed"))
+    features, seen = seen_features(lambda obs: obs, tuple(inputs))
+    assert (features.flatten().tolist(), seen.flatten().tolist()) == ([0, 6, 7], [0, 1, 1])
+
+
+def test_ends_in_two_results_of_one_round_are_both_seen():
+    env = open_env(
+        [
+            [one(0), one(1), two(9)],
+            [one(0, obs=5, ends=CUT)],
+            [one(1, obs=6, ends=CUT), two(9)],
+        ]
+    )
+    rows = play(env, 1)
+    assert read(rows, "next", "present") == [[True, True, True, False]]
+    assert read(rows, "next", "obs_0")[0][:2] == [5, 6]
+
+
+def test_a_departed_member_that_begins_anew_ends_as_it_was():
+    env = open_env(
+        [
+            [one(0, obs=1), one(1, obs=1)],
+            [one(0, obs=9, ends=END), one(1, obs=2)],
+            [one(0, obs=3), one(1, obs=3)],  # back in a later round: its slot saw zeros until now
+            [one(0, obs=8, ends=END), one(0, obs=4), one(1, obs=4)],  # back at once
+            [one(0), one(1)],
+        ]
+    )
+    rows = play(env, 3)
+    assert [row[0] for row in read(rows, "next", "terminated")] == [False, True, True]
+    assert [row[0] for row in read(rows, "next", "obs_0")] == [0, 0, 8]
+    assert [row[0] for row in read(rows, "next", "departed")] == [True, True, False]
+    assert rows["next", "Fake", "present"].all()
+    assert [row[0] for row in read(rows, "obs_0")] == [1, 0, 3]
+
+
+def test_a_departed_flag_of_an_ended_slot_gives_it_no_value():
+    batch = play(open_env(cut_team([one(10), one(11), one(12)])), 2)["Fake"]
+    root = play(open_env(cut_team([one(10), one(11), one(12)])), 3)["Fake"][-1]
+    following = play(open_env(cut_team([one(10), one(11), one(12)])), 2)["next", "Fake"]
+    assert following["departed"][-1, 0, 0] and not root["departed"][0, 0]
+
+    ended = (following["terminated"], following["truncated"])
+    torch.manual_seed(0)
+    reward, value, end_value = torch.randn(3, *following["done"].shape)
+    results = [
+        masked_gae(
+            *(reward, value, end_value, final, has_value(batch), has_value(last), *ended),
+            gamma=0.9,
+            gae_lambda=0.8,
+        )
+        for last, final in ((following[-1], value[0]), (root, torch.where(ended[1][-1], 7.0, value[0])))
+    ]
+    # one with the flag and one without: the ended rows cut the recursion
+    for one_way, other in zip(*results):
+        assert torch.equal(one_way, other)
+    assert results[0].known[:, 0].all()
+
+
+@pytest.mark.parametrize("name", ["DungeonEscape", "SoccerTwos"])
+def test_next_equals_the_following_root_where_no_episode_ended(name):
+    torch.manual_seed(0)
+    rows = play(UnityEnv(lambda seed: make_scene(name, seed=seed, num_areas=2)), 120)
+    for behavior in rows["next"].keys():
+        following = rows["next", behavior][:-1]
+        same = ~following["done"].squeeze(-1)
+        assert same.any()
+        for key in (*("acting", "present", "departed", "is_init", "action_mask"), "obs_0"):
+            assert torch.equal(following[key][same], rows[behavior][1:][key][same]), key
+
+
+# --- departed members whose team is cut off
+
+
+@pytest.mark.parametrize(
+    ("last", "expected"),
+    [((CUT, CUT), CUT), ((END, END), END), ((CUT, END), CUT)],
+)
+def test_departed_members_end_as_the_last_of_their_team(last, expected):
+    env = open_env(
+        [
+            [one(0), one(1), one(2)],
+            [one(0, ends=END), one(1), one(2)],
+            [one(1, ends=last[0]), one(2, ends=last[1]), one(0, obs=3), one(1), one(2)],
+        ]
+    )
+    rows = play(env, 2)
+    assert read(rows, "next", "truncated") == [[False] * 3, [expected == CUT, *(end == CUT for end in last)]]
+    assert read(rows, "next", "terminated") == [[False] * 3, [expected == END, *(end == END for end in last)]]
+    assert read(rows, "next", "departed")[1] == [True, False, False]
+    assert read(rows, "next", "obs_0")[1] == [0, 0, 0]
+    # its own episode was a real end
+    assert [episode.interrupted for episode in env.pop_episodes()["Fake?team=0"]] == [
+        *(False, last[0] == CUT, last[1] == CUT)
+    ]
+
+
+def test_departed_members_go_on_while_one_of_their_team_is_left():
+    env = open_env(
+        [
+            [one(0), one(1), one(2)],
+            [one(0, ends=END), one(1), one(2)],
+            [one(1, ends=CUT), one(2, group_reward=1)],
+            [one(2, ends=CUT, group_reward=2), one(0)],
+        ]
+    )
+    rows = play(env, 3)
+    assert [row[0] for row in read(rows, "next", "truncated")] == [False, False, True]
+    assert [row[0] for row in read(rows, "next", "departed")] == [True, True, True]
+    assert not rows["next", "Fake", "terminated"].any()

@@ -90,11 +90,7 @@ class UnityEnv(EnvBase):
 
     def pop_episodes(self) -> dict[str, list[Episode]]:
         """Return the episodes that finished since the last call, a list for each behavior."""
-        out = {name: behavior.finished for name, behavior in self._behaviors.items()}
-        for behavior in self._behaviors.values():
-            behavior.finished = []
-
-        return out
+        return {name: behavior.returns.pop() for name, behavior in self._behaviors.items()}
 
     _crashed: list[CrashedEpisodes]
     rounds: int = 0  # rounds played since the environment was opened
