@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,11 +19,11 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity import keys
 from mappo_unity.config.schema import ModelConfig, bounded_log_std
-from mappo_unity.errors import ConfigError
-from mappo_unity.learning.actor_critic import make_actor
+from mappo_unity.learning.actor_critic import PerMember, make_actor
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
 from mappo_unity.policies.layouts import check_layout
+from mappo_unity.policies.members import MemberTable, Places, team_places
 from mappo_unity.runs import checkpoint
 
 
@@ -36,6 +36,10 @@ class Policy(Protocol):
 
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
         """Drop the memory of agents that begin an episode."""
+        ...
+
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Take note that episodes of these agents have ended, before the next `act`."""
         ...
 
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
@@ -53,6 +57,9 @@ class RandomPolicy:
         """Accept every behavior."""
 
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Remember nothing."""
+
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
         """Remember nothing."""
 
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
@@ -85,6 +92,13 @@ class ActorPolicy:
         self, layout: dict[str, Any], actors: dict[str, Any], deterministic: bool, name: str
     ) -> None:
         self.layout, self.actors, self.deterministic, self.name = layout, actors, deterministic, name
+        # where every member has a network of its own, an agent must stay the member that it is
+        self._per_member = {
+            name
+            for name, actor in actors.items()
+            if any(isinstance(part, PerMember) for part in actor.modules())
+        }
+        self._members: dict[str, MemberTable] = {}
 
     @torch.no_grad()
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
@@ -92,7 +106,7 @@ class ActorPolicy:
         name = keys.policy_name(behavior)
         self.check(behavior, spec)
 
-        places = team_places(steps.group_id, self.layout[name]["team_size"])
+        places = self._places(behavior, steps)
         device = next(self.actors[name].parameters()).device
         entries = {k: _spread(v, places).to(device) for k, v in _inputs(steps, spec).items()}
 
@@ -118,6 +132,19 @@ class ActorPolicy:
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
         """Remember nothing."""
 
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Take note that the places of these agents may be given to new members of their teams."""
+        if behavior in self._members:
+            self._members[behavior].end(agent_ids)
+
+    def _places(self, behavior: str, steps: DecisionSteps) -> Places:
+        name = keys.policy_name(behavior)
+        team_size = self.layout[name]["team_size"]
+        if name not in self._per_member:
+            return team_places(steps.group_id, team_size)
+        table = self._members.setdefault(behavior, MemberTable(team_size))
+        return table.places(steps.agent_id, steps.group_id)
+
 
 class CheckpointPolicy(ActorPolicy):
     """The actors of a checkpoint.
@@ -132,39 +159,6 @@ class CheckpointPolicy(ActorPolicy):
         super().__init__(state["layout"], actors, deterministic, f"checkpoint {path}")
         self.path = path
         self.agent_steps = int(state["agent_steps"])
-
-
-class Places(NamedTuple):
-    """Where each row of a result stands among the teams."""
-
-    teams: np.ndarray  # int [n]
-    members: np.ndarray  # int [n]
-    shape: tuple[int, int]  # G, A
-
-
-def team_places(group_id: np.ndarray, team_size: int) -> Places:
-    """Give each row its team and its place in it: the order of the rows of a group.
-
-    Members that are not asked at the same time are not told apart by this; it matters only to
-    policies with a network for each member.
-    """
-    # Group 0 is none: each of its agents is a team of its own, numbered after the groups.
-    alone = np.arange(len(group_id)) + int(group_id.max(initial=0)) + 1
-    keys_ = np.where(group_id > 0, group_id, alone)
-    _, teams = np.unique(keys_, return_inverse=True)
-
-    # Stable, so that the members of a team keep the order of their rows.
-    order = np.argsort(teams, kind="stable")
-    starts = np.flatnonzero(np.r_[True, np.diff(teams[order]) > 0])
-    members = np.empty(len(teams), np.int64)
-    members[order] = np.arange(len(teams)) - np.repeat(starts, np.diff(np.r_[starts, len(teams)]))
-
-    if members.max(initial=0) >= team_size:
-        raise ConfigError(
-            f"a team of {members.max() + 1} agents is larger than the policy's {team_size} members"
-        )
-
-    return Places(teams, members, (int(teams.max(initial=-1)) + 1, team_size))
 
 
 def _inputs(steps: DecisionSteps, spec: BehaviorSpec) -> dict[str, np.ndarray]:
