@@ -49,8 +49,7 @@ def play(
             _forget_crashed(env, name, running, counts)
             _end_episodes(name, terminal, running, counts)
             actor = policy[name] if isinstance(policy, dict) else policy
-            # Who is not running here begins an episode: what it remembers is of another.
-            actor.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
+            _tell(actor, name, decision, terminal, running)
             _go_on(name, decision, running, counts)
             if len(decision):
                 silent = 0
@@ -93,6 +92,12 @@ def _forget_crashed(env: BaseEnv, name: str, running: dict, counts: _Counts) -> 
         episode = running.pop((name, int(agent)), None)
         if episode is not None and episode[0]:
             counts.begun[name] -= 1
+
+
+def _tell(policy: Policy, name: str, decision: Any, terminal: Any, running: dict) -> None:
+    """Tell a policy whose episodes have ended, and who begins one: its memory is of another episode."""
+    policy.end(name, terminal.agent_id.tolist())
+    policy.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
 
 
 def _end_episodes(name: str, terminal: Any, running: dict, counts: _Counts) -> None:

@@ -79,6 +79,9 @@ class OnnxPolicy:
         for agent in agent_ids:
             self._memory.pop((behavior, int(agent)), None)
 
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Do nothing: what was remembered is dropped when an agent begins again."""
+
     def check(self, behavior: str, spec: BehaviorSpec) -> None:
         """Raise ConfigError if this file cannot play that behavior."""
         # Called with every step: what fitted once is not compared again.
@@ -214,6 +217,9 @@ class OnnxFolder:
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
         """Drop the memory of agents that begin an episode."""
         self._policy(behavior).forget(behavior, agent_ids)
+
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Do nothing: see `OnnxPolicy.end`."""
 
     def _policy(self, behavior: str) -> OnnxPolicy:
         name = keys.policy_name(behavior)
