@@ -246,3 +246,100 @@ def test_departed_members_go_on_while_one_of_their_team_is_left():
     assert [row[0] for row in read(rows, "next", "truncated")] == [False, False, True]
     assert [row[0] for row in read(rows, "next", "departed")] == [True, True, True]
     assert not rows["next", "Fake", "terminated"].any()
+
+
+# --- group rewards of departed members
+
+
+def departed_earns(script, slot=0, **options):
+    """Return what the slot of a departed member earns as group reward, round by round."""
+    return [
+        row[slot] for row in read(play(open_env(script, **options), len(script) - 1), "next", "group_reward")
+    ]
+
+
+def test_a_departed_member_earns_a_group_reward_once_though_mates_report_at_other_times():
+    script = [
+        [one(0), one(1), one(2)],
+        [one(0, ends=END), one(2)],
+        # the team gets 1: 2 ends and tells of it, 1 not yet
+        [one(2, ends=END, group_reward=1), two(9)],
+        # then it gets 0.5 more: 1 tells of both
+        [one(1, group_reward=1.5)],
+        [one(1, group_reward=0.25)],
+    ]
+    assert departed_earns(script, max_teams=2) == [0, 1, 0.5, 0.25]
+    assert departed_earns(script, slot=2, max_teams=2) == [0, 1, 0.5, 0.25]
+    assert departed_earns(script, slot=1, max_teams=2) == [0, 0, 1.5, 0.25]
+
+
+def test_what_a_member_earned_before_it_departed_is_not_paid_again():
+    script = [
+        [one(0), one(1)],
+        # the team gets 2, then -0.5: 0 tells of the first, and departs after the second
+        [one(0, group_reward=2)],
+        [one(0, group_reward=-0.5, ends=END), two(9)],
+        # -3 more: 1 has been asked last at the start
+        [one(1, group_reward=-1.5)],
+        [one(1, group_reward=0), two(9)],
+        [one(1, group_reward=-1, ends=END), two(9)],
+    ]
+    assert departed_earns(script, max_teams=2) == [2, -0.5, -3, 0, -1]
+
+
+def test_staggered_mates_of_a_departed_member_that_earn_below_zero():
+    script = [
+        [one(0), one(1), one(2)],
+        [one(0, ends=END, group_reward=1), one(1, group_reward=1), one(2, group_reward=1)],
+        [one(1, group_reward=-2)],  # the team has -1
+        [one(2, group_reward=-1.5)],  # and -0.5
+        [one(1, group_reward=0.5)],  # known already
+        [one(1, group_reward=0.25), one(2, group_reward=0.25)],
+        [one(1), one(2)],
+    ]
+    assert departed_earns(script) == [1, -2, 0.5, 0, 0.25, 0]
+
+
+def test_a_member_that_joins_knows_nothing_of_what_was_before():
+    script = [
+        [one(0), one(1), one(2)],
+        [one(0, ends=END, group_reward=4), one(1, group_reward=4), one(2, ends=CUT, group_reward=4)],
+        [one(7), one(1, group_reward=1)],  # takes the place of 2; comes first, with nothing earned yet
+        [one(7, group_reward=2)],
+        [one(1, group_reward=2.5), one(7, group_reward=0.5)],
+    ]
+    assert departed_earns(script) == [4, 1, 2, 0.5]
+
+
+def test_a_team_s_next_episode_begins_with_nothing():
+    once = [
+        [one(0), one(1)],
+        [one(0, ends=END), one(1)],
+        [one(1, ends=END, group_reward=5), one(0), one(1)],
+        [one(0, ends=END), two(9)],
+        [one(1, group_reward=0.5)],
+    ]
+    assert departed_earns(once, max_teams=2) == [0, 5, 0, 0.5]
+
+
+def test_a_snapshot_knows_what_was_paid_and_an_older_one_begins_with_nothing():
+    script = [
+        [one(0), one(1), two(9)],
+        [one(0, ends=END, group_reward=2), two(9)],
+        [one(1, group_reward=2.5)],
+    ]
+    env = UnityEnv(lambda seed: Snapshots(script))
+    play(env, 1)
+    state = env.get_state()
+    assert state["behaviors"]["Fake?team=0"]["team_total"].tolist() == [2, 0]
+    for leave_out, expected in (([], 0.5), (["team_total", "seen"], 2.5)):
+        for name in leave_out:
+            del state["behaviors"]["Fake?team=0"][name]
+        other = UnityEnv(lambda seed: Snapshots(script))
+        other.set_state(state)
+        assert read(play(other, 1), "next", "group_reward") == [[expected, 2.5, 0, 0]]
+
+
+def test_without_death_masking_no_snapshot_holds_group_rewards():
+    env = open_env([[one(0), one(1)]], death_masking=False)
+    assert "seen" not in env.behaviors["Fake?team=0"].get_state()

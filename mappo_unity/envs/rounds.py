@@ -19,6 +19,7 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps
 
 from mappo_unity.envs.ends import RoundEnds
+from mappo_unity.envs.group_rewards import GroupRewards
 from mappo_unity.envs.returns import Episode as Episode
 from mappo_unity.envs.returns import Returns
 from mappo_unity.envs.slots import SlotTable
@@ -52,6 +53,9 @@ class BehaviorState:
         self.order = np.zeros(0, np.int64)  # slots in the order of the last DecisionSteps
 
         self.returns = Returns(count)
+        self.group_rewards: GroupRewards | None = None  # of teams whose members depart
+        if self.death_masking and self.slots.team_size > 1:
+            self.group_rewards = GroupRewards(self.slots.num_teams, self.slots.team_size)
 
         self.begin_round()
 
@@ -102,6 +106,8 @@ class BehaviorState:
         self.present[:] = False
         self.departed[:] = False
         self.returns.forget()
+        if self.group_rewards is not None:
+            self.group_rewards.forget()
         self.begin_round()
 
     def actions(self, action: np.ndarray, limit: float) -> ActionTuple:
@@ -154,7 +160,7 @@ class BehaviorState:
         # who ends while its team plays on departs: its slot stays, sees zeros and earns on
         leaves = plays_on & ~interrupted if self.death_masking else np.zeros(len(rows), bool)
         # before these depart too: they have received their group reward above
-        self._share_group_reward(rows, terminal.group_reward[own])
+        self._share_group_reward(rows, terminal.group_reward[own], np.ones(len(rows), bool))
         if np.count_nonzero(leaves):
             self._depart(rows[leaves], [o[leaves] for o in observations])
 
@@ -176,6 +182,7 @@ class BehaviorState:
         self.returns.length[slots] += 1
 
         goes_on = self.present[slots] & ~self.departed[slots]
+        self._share_group_reward(slots, decision.group_reward, goes_on)
         if np.count_nonzero(goes_on) == len(goes_on):
             earners, reward, group_reward = slots, decision.reward, decision.group_reward
         else:  # what a first decision brings was earned by no action
@@ -188,8 +195,6 @@ class BehaviorState:
 
         self.reward[earners] += reward
         self.group_reward[earners] += group_reward
-
-        self._share_group_reward(slots, decision.group_reward)
 
         for own, new in zip(self.obs, decision.obs):
             own[slots] = new
@@ -234,20 +239,22 @@ class BehaviorState:
             self.departed[departed] = False
             self.present[departed] = False
             self._ends.departed(departed, self._shapes)
+        if self.group_rewards is not None:
+            self.group_rewards.end(over)
 
-    def _share_group_reward(self, rows: np.ndarray, group_reward: np.ndarray) -> None:
-        """Give the departed what a team mate of theirs received as group reward just now."""
-        if not np.count_nonzero(self.departed):
+    def _share_group_reward(self, slots: np.ndarray, reward: np.ndarray, known: np.ndarray) -> None:
+        """Give the departed what members of their team, `known` and new ones, report now."""
+        rewards = self.group_rewards
+        if rewards is None:
+            return
+        if np.count_nonzero(known) < len(known):
+            rewards.join(slots[~known])
+        if rewards.changes_nothing(reward):
             return
 
-        # Unity adds a group reward to every member: the first that reports stands for its team
-        teams, first = np.unique(rows // self.slots.team_size, return_index=True)
-
-        share = np.zeros(self.slots.num_teams, np.float32)
-        share[teams] = group_reward[first]
-
+        earned = rewards.report(slots, reward, known, self.present & ~self.departed)
         departed = np.flatnonzero(self.departed)
-        self.group_reward[departed] += share[departed // self.slots.team_size]
+        self.group_reward[departed] += earned[departed // self.slots.team_size]
 
     _ARRAYS = ("acting", "first", "present", "departed", "order", "mask")
 
@@ -255,6 +262,8 @@ class BehaviorState:
         """Return everything that a round begun after `set_state` needs."""
         state = {name: getattr(self, name).copy() for name in self._ARRAYS}
         state |= self.returns.get_state()
+        if self.group_rewards is not None:
+            state |= self.group_rewards.get_state()
         return state | {"slots": self.slots.get_state(), "obs": [o.copy() for o in self.obs]}
 
     def set_state(self, state: dict) -> None:
@@ -265,4 +274,6 @@ class BehaviorState:
             setattr(self, name, np.array(state[name], getattr(self, name).dtype))
         self.obs = [np.array(o, np.float32) for o in state["obs"]]
         self.returns.set_state(state)
+        if self.group_rewards is not None:
+            self.group_rewards.set_state(state)
         self.slots.set_state(state["slots"])
