@@ -41,15 +41,19 @@ def compare(
     session = open_session(data, "the export")
     feed = _feed(session, sensors, sample)
     with torch.no_grad():
-        params = actor[0](TensorDict(sample, [len(next(iter(sample.values())))])).get("params")
-    expected = ActionDistribution(params, actor[0].module.layout, sample.get(keys.MASK))
+        out = actor[0](TensorDict(sample, [len(next(iter(sample.values())))]))
+    params = out.get("params")
+    expected = ActionDistribution(params, actor.layout, sample.get(keys.MASK))
 
     found = _run(session, feed, "deterministic_", expected)
     error = max(_continuous_error(expected, found), _branch_error(expected, found))
+    if actor.has_memory:
+        after = torch.from_numpy(session.run(["recurrent_out"], feed)[0][:, 0])
+        error = max(error, float((after - out.get(keys.MEMORY_AFTER)).abs().max()))
     # Asked this way round because nan, which is above no tolerance, must not pass.
     if not error <= TOLERANCE:
         raise ExportError(
-            "the export plays otherwise than the checkpoint: its deterministic actions differ by "
+            "the export plays otherwise than the checkpoint: its deterministic actions (or memory) differ by "
             f"{error:.3g}, more than {TOLERANCE:g}"
         )
 
@@ -81,6 +85,8 @@ def _feed(
 
     if keys.MASK in arrays:
         feed["action_masks"] = arrays[keys.MASK]
+    if keys.MEMORY in arrays:
+        feed["recurrent_in"] = arrays[keys.MEMORY][:, None]
 
     return {name: np.ascontiguousarray(values, np.float32) for name, values in feed.items()}
 
