@@ -226,9 +226,9 @@ def note_unmarked(name: str, sensors: Sequence[ObservationSpec], note: Callable[
     for sensor in filter(looks_unmarked, sensors):
         channels, height, width = sensor.shape
         note(
-            f"note: sensor {sensor.name!r} of {name} has shape {tuple(sensor.shape)} and marks no dimensions: "
-            f"it is taken for {channels} channels of {height} x {width}; mark height and width with "
-            "dimension_property where that is not so"
+            f"note: sensor {sensor.name!r} of {name} has shape {tuple(sensor.shape)} and marks no "
+            f"dimensions: it is taken for {channels} channels of {height} x {width}; mark height and width "
+            "with dimension_property where that is not so"
         )
 
 
