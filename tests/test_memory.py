@@ -205,10 +205,8 @@ def test_a_run_is_resumed_to_the_bit_and_its_export_plays_alike(
     assert train_main([*lines, "max_steps=1024", "hydra.run.dir=whole"]) == 0
     assert train_main([*lines, "max_steps=512", "hydra.run.dir=parts"]) == 0
     assert train_main(["resume=parts", "max_steps=1024"]) == 0
-    one, two = (
-        checkpoint.load(sorted(Path(name, "checkpoints").glob("step_*.pt"))[-1])
-        for name in ("whole", "parts")
-    )
+    newest = (sorted(Path(name, "checkpoints").glob("step_*.pt"))[-1] for name in ("whole", "parts"))
+    one, two = map(checkpoint.load, newest)
     for part in ("actor", "critic"):
         saved = one["learners"]["Hallway"][part], two["learners"]["Hallway"][part]
         assert all(torch.equal(saved[0][name], saved[1][name]) for name in saved[0])

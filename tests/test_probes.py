@@ -167,7 +167,6 @@ def test_time_limits_bootstrap_and_real_ends_do_not(tmp_path, probe, expected):
 
 
 def test_every_probe_is_tested():
-    text = "".join(
-        Path(__file__).with_name(name).read_text() for name in ("test_probes.py", "test_memory.py")
-    )
+    files = (Path(__file__).with_name(name) for name in ("test_probes.py", "test_memory.py"))
+    text = "".join(file.read_text() for file in files)
     assert all(f'"{name}"' in text for name in PROBES)

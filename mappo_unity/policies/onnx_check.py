@@ -39,7 +39,7 @@ def compare(
         ExportError: they play differently.
     """
     session = open_session(data, "the export")
-    feed = _feed(session, sensors, sample)
+    feed = _feed(session, actor[0].module.encoder, sensors, sample)
     with torch.no_grad():
         out = actor[0](TensorDict(sample, [len(next(iter(sample.values())))]))
     params = out.get("params")
@@ -67,11 +67,12 @@ def compare(
 
 
 def _feed(
-    session: Any, sensors: Sequence[Sequence[int]], sample: dict[str, torch.Tensor]
+    session: Any, encoder: Any, sensors: Sequence[Sequence[int]], sample: dict[str, torch.Tensor]
 ) -> dict[str, np.ndarray]:
     """Split an actor's inputs into those of the graph."""
     arrays = {key: values.numpy() for key, values in sample.items()}
     shapes = {i.name: list(i.shape) for i in session.get_inputs()}
+    images = iter(encoder.images)
     feed, start = {}, 0
 
     # The actor takes all vectors as one entry; each sensor has its columns of it, in their order.
@@ -81,7 +82,8 @@ def _feed(
             feed[name] = arrays[keys.OBS][:, start : start + shape[0]]
             start += shape[0]
         else:
-            feed[name] = fit_image(arrays[keys.SENSOR.format(index)], shapes[name])
+            image = arrays[keys.SENSOR.format(index)]
+            feed[name] = fit_image(image, shapes[name], next(images).channels_last)
 
     if keys.MASK in arrays:
         feed["action_masks"] = arrays[keys.MASK]
