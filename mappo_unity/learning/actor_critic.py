@@ -7,6 +7,7 @@ Both are TensorDict modules, which read observations (and ``action_mask``) and w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDictBase
@@ -16,11 +17,12 @@ from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
-from mappo_unity.config.schema import CriticKind, ModelConfig
+from mappo_unity.config.schema import CriticKind, DistributionKind, ModelConfig
 from mappo_unity.learning.critics import CentralCritic, LocalCritic, PooledCritic
-from mappo_unity.learning.distributions import ActionDistribution, ActionLayout
+from mappo_unity.learning.distributions import ActionDistribution, ActionLayout, state_log_std
 from mappo_unity.learning.encoders import Encoder, ObsLayout
 from mappo_unity.learning.mlp import make_mlp
+from mappo_unity.learning.network_options import apply_options
 
 LOG_STD_RANGE = (-5.0, 2.0)
 
@@ -32,12 +34,16 @@ class Actor(nn.Module):
         super().__init__()
         self.encoder = Encoder(obs, cfg.normalize_obs)
 
-        outputs = layout.continuous + layout.num_logits
+        # a squashed action's deviation depends on the state: one more output for each column
+        means = layout.continuous * (2 if layout.squashed else 1)
+        outputs = means + layout.num_logits
         # the small last gain makes first actions almost independent of what is observed
         self.net = make_mlp(self.encoder.size, list(cfg.hidden), outputs, cfg.activation, last_gain=0.01)
 
-        self.layout = layout
-        self.log_std = nn.Parameter(torch.full((layout.continuous,), float(cfg.init_log_std)))
+        self.layout, self.init_log_std = layout, float(cfg.init_log_std)
+        apply_options(self, cfg, means)
+        if not layout.squashed:
+            self.log_std = nn.Parameter(torch.full((layout.continuous,), self.init_log_std))
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return distribution parameters."""
@@ -48,6 +54,10 @@ class Actor(nn.Module):
             return out
 
         # means, logarithms of deviations, logits: the order that `ActionDistribution` reads
+        if self.layout.squashed:
+            log_std = state_log_std(out[..., size : 2 * size], self.init_log_std)
+            return torch.cat([out[..., :size], log_std, out[..., 2 * size :]], -1)
+
         log_std = self.log_std.clamp(*LOG_STD_RANGE).expand(*out.shape[:-1], size)
         if not self.layout.branches:
             return torch.cat([out, log_std], -1)
@@ -123,6 +133,9 @@ class UnityActor(ProbabilisticActor):
 
 def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig) -> UnityActor:
     """Build the policy as a TorchRL actor over the entries of one policy name."""
+    squashed = cfg.action_distribution is DistributionKind.tanh_normal and layout.continuous > 0
+    layout = replace(layout, squashed=squashed)
+
     if cfg.share_parameters or team_size == 1:
         net: nn.Module = Actor(obs, layout, cfg)
     else:
@@ -146,10 +159,12 @@ def make_critic(obs: ObsLayout, team_size: int, cfg: ModelConfig) -> TensorDictM
 
 def _critic(obs: ObsLayout, team_size: int, cfg: ModelConfig) -> nn.Module:
     if team_size == 1 or cfg.critic is CriticKind.local:
-        return LocalCritic(obs, cfg)
-    if cfg.critic is CriticKind.central:
-        return CentralCritic(obs, team_size, cfg)
-    return PooledCritic(obs, team_size, cfg)
+        net: nn.Module = LocalCritic(obs, cfg)
+    elif cfg.critic is CriticKind.central:
+        net = CentralCritic(obs, team_size, cfg)
+    else:
+        net = PooledCritic(obs, team_size, cfg)
+    return apply_options(net, cfg)
 
 
 class JointPolicy(TensorDictModuleBase):
