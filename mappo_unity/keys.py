@@ -16,10 +16,14 @@ OBS = "observation"  # float32 [..., A, O]: vector sensors, concatenated in the 
 SENSOR = "obs_{}"  # float32 [..., A, *sensor shape]: sensor i before concatenation
 ACTION = "action"  # see models.ActionLayout
 LOG_PROB = "action_log_prob"  # float32 [..., A]
+LOG_PROBS = "action_log_probs"  # float32 [..., A, C + K]: of each component, where ppo.ratio=component
 MASK = "action_mask"  # bool [..., A, sum of branches]: True = allowed (Unity's sense, turned round)
 ACTING = "acting"  # bool [..., A, 1]: the agent requested a decision in this round
+MEMORY = "memory"  # float32 [..., A, M]: the actor's state under which the agent acts
+MEMORY_AFTER = "memory_after"  # float32 [..., A, M]: the actor's state after that decision
 PRESENT = "present"  # bool [..., A, 1]: an agent holds the slot (or held it and departed)
 DEPARTED = "departed"  # bool [..., A, 1]: the agent ended for good while its team plays on
+FIRST = "is_init"  # bool [..., A, 1]: the decision requested is the first of its agent's episode
 REWARD = "reward"  # float32 [..., A, 1]: individual reward that arrived in this round
 GROUP_REWARD = "group_reward"  # float32 [..., A, 1]: reward of the agent's team, likewise
 DONE = "done"  # bool [..., A, 1]: terminated or truncated

@@ -57,6 +57,12 @@ def test_rows_of_an_episode_reach_back_to_the_one_before() -> None:
     assert episode_rows(done, 4, torch.tensor([True, True]))[:, 1].tolist() == [True] * 5 + [False]
 
 
+def test_slots_follow_the_batch_to_its_device() -> None:
+    # tensors on "meta" mix with those on the CPU as little as those on a GPU do
+    done = torch.zeros(6, 2, dtype=torch.bool, device="meta")
+    assert episode_rows(done, 4, torch.tensor([True, False])).device == done.device
+
+
 def test_a_cut_episode_neither_counts_nor_is_learned_from() -> None:
     # Agent 0 ends by itself in result 1; the player fails in result 3 and takes both agents' episodes along.
     script = [
@@ -78,7 +84,7 @@ def test_a_cut_episode_neither_counts_nor_is_learned_from() -> None:
     truncated = batch["next", "Fake", "truncated"].reshape(5, 2)
     assert truncated.tolist() == [[False] * 2] * 2 + [[True, True]] + [[False] * 2] * 2
     # row t holds the decisions of result t: agent 0's cut episode is rows 1 and 2, agent 1's rows 0 to 2
-    assert mask_crashed_episodes(batch, cuts, env) == 2 + 3
+    assert mask_crashed_episodes(batch, cuts, env)[0] == 2 + 3
     assert batch["Fake", "acting"].reshape(5, 2).T.tolist() == [
         [True, False, False, True, True],
         [False, False, False, True, True],
@@ -123,8 +129,9 @@ def test_drops_reach_batches_of_the_collector() -> None:
     base.breaks_at, base.cut = 8, (1,)
     base.script[8] = [Record(1, ends="interrupted"), Record(0), Record(1)]
     batch = next(batches)
-    dropped = mask_crashed_episodes(batch, env.pop_crashed_episodes(), env)
+    dropped, void = mask_crashed_episodes(batch, env.pop_crashed_episodes(), env)
     assert dropped == 3  # results 5, 6 and 7 are rows 0 to 2 of the second batch
+    assert void["Fake"].flatten().tolist() == [False, True]  # its episode had begun in the first
     assert batch["Fake", "acting"].reshape(5, 2).T.tolist() == [[True] * 5, [False] * 3 + [True] * 2]
     collector.shutdown()
 
@@ -182,4 +189,4 @@ def test_runs_without_players_have_no_such_columns(tmp_path: Path) -> None:
     from mappo_unity.training.setup import set_up
 
     with set_up(options(1), tmp_path) as setup, setup.collecting() as batches:
-        assert RunState(options(1), tmp_path, setup).mask_crashed(next(batches)) == {}
+        assert RunState(options(1), tmp_path, setup).count_crashed(next(batches)) == {}

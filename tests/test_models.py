@@ -9,6 +9,7 @@ from torch.distributions import Categorical, Normal
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity.config.schema import ModelConfig
+from mappo_unity.errors import ConfigError
 from mappo_unity.learning.actor_critic import Actor, JointPolicy, make_actor
 from mappo_unity.learning.distributions import ActionDistribution, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout, RunningNorm
@@ -81,6 +82,25 @@ def test_the_first_actions_are_near_the_middle_and_spread_by_init_log_std():
     params = actor(torch.randn(100, 4))
     assert params[:, :2].abs().max() < 0.2
     assert params[:, 2:].unique().item() == pytest.approx(-0.5)
+
+
+@pytest.mark.parametrize(("start", "value"), [(-5.0, -5.0), (2.0, 2.0), (-7.3, -5.0), (2.7, 2.0), (0.3, 0.3)])
+def test_deviations_learn_at_their_bounds_and_come_back_from_beyond(start, value):
+    actor = Actor(ObsLayout(4), ActionLayout(2, ()), ModelConfig())
+    with torch.no_grad():
+        actor.log_std.fill_(start)
+    log_std = actor(torch.randn(10, 4))[:, 2:]
+    assert log_std.unique().item() == pytest.approx(value, abs=1e-7)
+    log_std.sum().backward()
+    assert actor.log_std.grad.tolist() == [10.0, 10.0]
+    actor.project()
+    assert actor.log_std.tolist() == pytest.approx([value, value], abs=1e-7)
+
+
+@pytest.mark.parametrize("value", [-5.1, 2.1])
+def test_initial_deviations_beyond_their_bounds_are_refused(value):
+    with pytest.raises(ConfigError, match=f"model.init_log_std={value} .* must be from -5 to 2"):
+        ModelConfig(init_log_std=value)
 
 
 def test_actor_writes_action_and_log_prob():

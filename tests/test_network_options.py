@@ -19,6 +19,7 @@ from mappo_unity.config.schema import (
     DistributionKind,
     EnvConfig,
     LogConfig,
+    MemoryKind,
     ModelConfig,
     PPOConfig,
     Schedule,
@@ -34,12 +35,14 @@ from mappo_unity.training.trainer import train
 
 IMAGE = ObsLayout.from_shapes([(5,), (3, 8, 8)])
 SQUASHED = ActionLayout(2, (), squashed=True)
+HYBRID = ActionLayout(1, (3,))
 TANH = {"action_distribution": DistributionKind.tanh_normal}
 
 
 def critic(kind, **options):
     team_size = 1 if kind is CriticKind.local else 3
-    return make_critic(ObsLayout(5), team_size, ModelConfig(hidden=[16, 8], critic=kind, **options))
+    cfg = ModelConfig(hidden=[16, 8], critic=kind, **options)
+    return make_critic(ObsLayout(5), team_size, cfg, HYBRID)
 
 
 # --- layer norms
@@ -47,12 +50,10 @@ def critic(kind, **options):
 
 @pytest.mark.parametrize("kind", CriticKind)
 def test_every_hidden_activation_of_a_critic_is_normalised(kind):
-    if kind.value == "poca":
-        pytest.skip("built for its actions too, see test_poca.py")
     net = critic(kind, layer_norm=True)
     widths = [m.normalized_shape[0] for m in net.modules() if isinstance(m, nn.LayerNorm)]
-    hidden = {"local": [16, 8], "central": [16, 8], "mean": [16, 8], "attention": [16, 8]}[kind.value]
-    assert widths == [5, *hidden]
+    entities = [16, 16] if kind is CriticKind.poca else []  # of both kinds
+    assert widths == [5, *entities, 16, 8]
     plain = critic(kind)
     assert not any(isinstance(m, nn.LayerNorm) for m in plain.modules())
 
@@ -119,6 +120,18 @@ def test_members_of_a_team_do_not_begin_alike():
     cfg = ModelConfig(hidden=[4], weight_init=WeightInit.kaiming_normal, share_parameters=False)
     nets = make_actor(ObsLayout(5), ActionLayout(1, ()), 2, cfg)[0].module.nets
     assert not torch.equal(nets[0].net[0].weight, nets[1].net[0].weight)
+
+
+@pytest.mark.parametrize("memory", [MemoryKind.lstm, MemoryKind.gru])
+def test_heads_behind_a_memory_begin_as_others(memory):
+    torch.manual_seed(0)
+    cfg = ModelConfig(memory=memory, memory_size=256, weight_init=WeightInit.kaiming_normal, **TANH)
+    actor = make_actor(ObsLayout(5), ActionLayout(100, (90,)), 1, cfg)[0].module
+    fan = actor.head.in_features
+    assert actor.head.weight[:200].std().item() == pytest.approx(0.2 / math.sqrt(fan), rel=0.03)
+    assert actor.head.weight[200:].std().item() == pytest.approx(0.1 / math.sqrt(fan), rel=0.03)
+    head = make_critic(ObsLayout(5), 1, cfg, HYBRID).module.head
+    assert head.weight.abs().max() > 0.05 and head.weight.abs().max() <= math.sqrt(6 / (fan + 1))
 
 
 # --- squashed actions
@@ -199,7 +212,7 @@ def test_a_normaliser_with_a_prior_is_ml_agents_one():
 def test_the_option_reaches_actor_and_critic():
     cfg = ModelConfig(hidden=[4], obs_norm_prior=True)
     actor = make_actor(ObsLayout(3), ActionLayout(1, ()), 2, cfg)
-    for net in (actor, make_critic(ObsLayout(3), 2, cfg)):
+    for net in (actor, make_critic(ObsLayout(3), 2, cfg, HYBRID)):
         norms = [m for m in net.modules() if isinstance(m, RunningNorm)]
         assert norms and all(norm.count == 1 and norm.epsilon == 0 for norm in norms)
 
@@ -209,7 +222,12 @@ def test_the_option_reaches_actor_and_critic():
 
 @pytest.mark.parametrize(
     "options",
-    [{"layer_norm": True}, {"weight_init": WeightInit.kaiming_normal, "obs_norm_prior": True}, TANH],
+    [
+        {"layer_norm": True},
+        {"layer_norm": True, "memory": MemoryKind.gru, "memory_size": 16} | TANH,
+        {"weight_init": WeightInit.kaiming_normal, "obs_norm_prior": True},
+        TANH,
+    ],
 )
 def test_a_run_trains_exports_and_resumes(options, tmp_path):
     cfg = Config(
@@ -231,8 +249,9 @@ def test_a_run_trains_exports_and_resumes(options, tmp_path):
     ends = [checkpoint.load(path)["learners"]["3DBall"]["actor"] for path in (unbroken, resumed)]
     assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
 
-    onnx = OnnxPolicy(whole / "checkpoints" / "final.onnx", deterministic=True)
-    assert onnx.agent_steps == 256
+    if "memory" not in options:
+        onnx = OnnxPolicy(whole / "checkpoints" / "final.onnx", deterministic=True)
+        assert onnx.agent_steps == 256
     CheckpointPolicy(whole / "checkpoints" / "best.pt", deterministic=True)
     model = checkpoint.load(unbroken)["model"]["3DBall"]
     assert {name: model[name] for name in options} == {

@@ -7,7 +7,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from mappo_unity.config.schema import Activation, ModelConfig, PPOConfig, Schedule, ValueLoss, ValueNormKind
+from mappo_unity.config.schema import (
+    Activation,
+    CriticKind,
+    ModelConfig,
+    PPOConfig,
+    Schedule,
+    ValueLoss,
+    ValueNormKind,
+)
 from mappo_unity.learning.actor_critic import make_actor, make_critic
 from mappo_unity.learning.distributions import ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
@@ -18,12 +26,12 @@ T, G, A, OBS = 12, 5, 2, 3
 TWO_CONTINUOUS = ActionLayout(2, ())
 
 
-def make_learner(layout=TWO_CONTINUOUS, **options):
+def make_learner(layout=TWO_CONTINUOUS, model=None, **options):
     torch.manual_seed(0)
-    model = ModelConfig(hidden=[16], activation=Activation.tanh)
+    model = ModelConfig(**{"hidden": [16], "activation": Activation.tanh} | (model or {}))
     cfg = PPOConfig(**({"minibatch_size": 40} | options))
     obs = ObsLayout(OBS)
-    return PolicyLearner(make_actor(obs, layout, A, model), make_critic(obs, A, model), cfg, T * G, A)
+    return PolicyLearner(make_actor(obs, layout, A, model), make_critic(obs, A, model, layout), cfg)
 
 
 def make_batch(learner, acting=None):
@@ -33,10 +41,8 @@ def make_batch(learner, acting=None):
         {"observation": torch.randn(*shape, OBS) * 4 + 1, "acting": flags if acting is None else acting},
         shape,
     )
-    if learner.actor[0].module.layout.branches:
-        batch["action_mask"] = torch.ones(
-            *shape, sum(learner.actor[0].module.layout.branches), dtype=torch.bool
-        )
+    if learner.actor.layout.branches:
+        batch["action_mask"] = torch.ones(*shape, sum(learner.actor.layout.branches), dtype=torch.bool)
     with torch.no_grad():
         out = learner.actor(batch.clone())
     batch["action"], batch["action_log_prob"] = out["action"], out["action_log_prob"]
@@ -59,16 +65,19 @@ def make_batch(learner, acting=None):
     return batch
 
 
+def prepared(learner, batch):
+    """Return all rows that an update would draw from."""
+    return learner.prepare(batch)[0][:]
+
+
 @pytest.mark.parametrize("layout", [ActionLayout(2, ()), ActionLayout(0, (3, 2)), ActionLayout(1, (4,))])
 def test_the_first_minibatch_has_ratio_one_and_kl_zero(layout):
     learner = make_learner(layout)
     for _ in range(3):  # after the normalisers have moved, too
         batch = make_batch(learner)
-        rows, _ = learner._prepare(batch)
-        learner.buffer.empty()
-        learner.buffer.extend(rows)
-        first = next(iter(learner.buffer))
-        terms = learner._step(first)
+        buffer, _ = learner.prepare(batch)
+        first = next(iter(buffer))
+        terms = learner.step(first)
         assert learner.loss.log_ratio.abs().max() < 1e-5
         assert terms["kl"].abs() < 1e-6
         assert terms["clip_fraction"] == 0
@@ -80,7 +89,7 @@ def test_rows_in_which_nobody_acted_carry_no_loss():
     acting[::2] = False
     learner = make_learner()
     batch = make_batch(learner, acting)
-    rows, _ = learner._prepare(batch)
+    rows = prepared(learner, batch)
     # five rounds of decisions with their outcomes; of the sixth only what ended in the last round
     ended_last = batch["next", "terminated"][-1]
     assert len(rows) == (T // 2 - 1) * G + int(ended_last.any(1).sum())
@@ -147,7 +156,7 @@ def test_schedules_reach_the_optimizer_and_the_loss():
 
 def test_the_huber_threshold_is_the_one_asked_for():
     learner = make_learner(value_loss=ValueLoss.huber, huber_delta=4.0, value_coef=1.0)
-    rows, _ = learner._prepare(make_batch(learner))
+    rows = prepared(learner, make_batch(learner))
     rows["value_target"] = torch.linspace(-30, 30, rows["value_target"].numel()).view_as(rows["value_target"])
     value = learner.critic(rows.clone())["state_value"]
     expected = torch.nn.functional.huber_loss(value, rows["value_target"], delta=4.0)
@@ -167,15 +176,29 @@ def test_state_goes_on_to_the_bit():
     assert one.value_norm.statistics() == two.value_norm.statistics()
 
 
-def test_popart_moves_the_statistics_and_leaves_the_values():
-    learner = make_learner(normalize_values=ValueNormKind.popart)
+@pytest.mark.parametrize("share", [True, False])
+@pytest.mark.parametrize("kind", list(CriticKind))
+@pytest.mark.parametrize("hidden", [[16], [1], [4, 1, 1]])
+def test_popart_moves_the_statistics_and_leaves_the_values(kind, hidden, share):
+    model = {"critic": kind, "critic_hidden": hidden, "share_parameters": share}
+    if kind is CriticKind.poca and not share:
+        pytest.skip("refused with the options")
+    learner = make_learner(model=model, normalize_values=ValueNormKind.popart)
+    assert len(learner.value_layers) == (1 if share else A)
     batch = make_batch(learner)
     learner._move_value_norm(torch.randn(100) * 5 + 30)
-    before = learner._values(batch)
+    before = learner.reader.values_of(batch)
     learner._move_value_norm(torch.randn(100) * 50 - 300)
-    after = learner._values(batch)
+    after = learner.reader.values_of(batch)
     assert learner.value_norm.statistics()[0] < -100
     assert torch.allclose(before, after, rtol=1e-4, atol=1e-2)
+
+
+def test_a_step_leaves_the_deviations_in_their_range():
+    learner = make_learner(model={"init_log_std": 2}, lr=0.5, entropy_coef=10.0, max_kl=1e9)
+    learner.learn(make_batch(learner), 0.0)
+    log_std = learner.actor[0].module.log_std.detach()
+    assert float(log_std.max()) == 2 and learner.rollbacks == 0
 
 
 def test_departed_members_train_the_critic_and_not_the_policy():
@@ -184,12 +207,12 @@ def test_departed_members_train_the_critic_and_not_the_policy():
     acting[:, :, 1] = False
     batch = make_batch(learner, acting)
     batch["departed"] = batch["next", "departed"] = ~acting
-    rows, _ = learner._prepare(batch)
+    rows = prepared(learner, batch)
     assert rows["actor_learns"][:, 1].sum() == 0
     assert rows["critic_learns"][:, 1].sum() == rows["critic_learns"][:, 0].sum() > 0
     one, two = copy.deepcopy(learner), copy.deepcopy(learner)
     other = rows.clone()
     other["value_target"][:, 1] += 5.0
-    first, second = one._step(rows), two._step(other)
+    first, second = one.step(rows), two.step(other)
     assert first["policy_loss"] == second["policy_loss"]
     assert first["value_loss"] < second["value_loss"]

@@ -16,7 +16,7 @@ from mappo_unity.config.schema import (
     PPOConfig,
     Schedule,
 )
-from mappo_unity.training.setup import entries_of, set_up
+from mappo_unity.training.setup import set_up
 
 GAMMA = 0.9
 
@@ -50,13 +50,13 @@ def learn(probe, tmp_path, iterations=60, actions="discrete", model=None, ppo=No
     )
     with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
         for _ in range(iterations):
-            batch = entries_of(next(batches), "Probe")
+            batch = next(batches).of("Probe")
             setup.learners["Probe"].learn(batch, 0.0)
-        return setup, entries_of(next(batches), "Probe")
+        return setup, next(batches).of("Probe")
 
 
 def values(setup, batch):
-    return setup.learners["Probe"]._values(batch).squeeze(-1)
+    return setup.learners["Probe"].reader.values_of(batch).squeeze(-1)
 
 
 def chosen(batch, actions="discrete"):

@@ -50,3 +50,9 @@ def test_a_checkpoint_that_does_not_know_a_model_option_yet_has_its_default(tmp_
     check_compatible(tmp_path, state, "X", {}, {"P": {"hidden": [8], "init_log_std": 0.0}})
     with pytest.raises(ValueError, match=r"model.init_log_std=0.0 there, 1.0 here"):
         check_compatible(tmp_path, state, "X", {}, {"P": {"hidden": [8], "init_log_std": 1.0}})
+
+
+def test_an_initial_deviation_beyond_todays_range_still_loads(tmp_path):
+    beyond = {"env_name": "X", "layout": {}, "model": {"P": {"hidden": [8], "init_log_std": -7.0}}}
+    check_compatible(tmp_path, beyond, "X", {}, {"P": {"hidden": [8], "init_log_std": -5}})
+    assert model_from_saved(beyond["model"]["P"]).init_log_std == -5

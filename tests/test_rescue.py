@@ -86,7 +86,7 @@ def test_a_bug_of_ours_is_saved_from_too(monkeypatch, capfd):
 def test_what_a_rescue_saved_goes_on_as_if_nothing_had_been(monkeypatch):
     arguments = [*BASIC, f"max_steps={5 * ITERATION}", "checkpoint_interval=1000000"]
     assert train_main([*arguments, "hydra.run.dir=whole"]) == 0
-    collect = RunState.mask_crashed
+    collect = RunState.count_crashed
     calls = []
 
     def broken(state, batch):
@@ -95,7 +95,7 @@ def test_what_a_rescue_saved_goes_on_as_if_nothing_had_been(monkeypatch):
             raise AssertionError("a bug of ours")
         return collect(state, batch)
 
-    monkeypatch.setattr(RunState, "mask_crashed", broken)
+    monkeypatch.setattr(RunState, "count_crashed", broken)
     with pytest.raises(AssertionError):
         train_main(arguments)
     assert train_main(["resume=run"]) == 0

@@ -257,12 +257,12 @@ def test_twenty_kills_end_like_an_undisturbed_run(tmp_path):
 
 
 def test_the_best_checkpoint_of_a_two_sided_run_has_the_weights_that_won_most(tmp_path, monkeypatch, capfd):
-    scores = iter([Score(wins=3, losses=7), Score(wins=8, losses=2), Score(wins=6, losses=4)])
+    scores = iter([Score(wins=3, losses=7), Score(wins=8, losses=2), Score(wins=2, losses=8)])
     monkeypatch.setattr(series, "play_matches", lambda *args: {"blue": next(scores)})
     train(soccer(5, checkpoint_interval=10**6), tmp_path)
     with open(tmp_path / "metrics.csv", newline="") as file:
         won = [row["win_rate_vs_random"] for row in csv.DictReader(file)]
-    assert won == ["", "0.3", "", "0.8", "0.6"]  # every second iteration, and after the last one
+    assert won == ["", "0.3", "", "0.8", "0.2"]  # every second iteration, and after the last one
     best = checkpoint.load(tmp_path / "checkpoints" / "best.pt")
     assert best["agent_steps"] == 4 * SOCCER_BATCH
     said = "640 steps: of 10 matches against a random side 8 won, 0 drawn, 2 lost"
@@ -273,7 +273,7 @@ def test_the_best_checkpoint_of_a_two_sided_run_has_the_weights_that_won_most(tm
     ("played", "best_at"),
     [
         ([Score(wins=10), Score(wins=10), Score(wins=10)], 6),  # as good as before: the newer weights
-        ([Score(draws=10), Score(wins=4, losses=6), Score(draws=9, losses=1)], 2),  # a draw is half a win
+        ([Score(draws=10), Score(losses=10), Score(draws=9, losses=1)], 2),  # a draw is half a win
         ([Score(losses=10), Score(losses=10), Score(losses=10)], 6),  # worse than none is not better
     ],
 )

@@ -45,8 +45,8 @@ def take_file(lines: list[str]) -> tuple[list[str], Path | None]:
 
     if files and last_value(rest, "resume") is not None:
         raise ConfigError(
-            f"{SWITCH} and resume cannot go together: a run is resumed with the options in its own config.yaml; "
-            "give those that change as option=value"
+            f"{SWITCH} and resume cannot go together: a run is resumed with the options in its own "
+            "config.yaml; give those that change as option=value"
         )
 
     return rest, Path(files[0]) if files else None

@@ -63,6 +63,36 @@ class CriticKind(Enum):
     central = "central"
     mean = "mean"
     attention = "attention"
+    poca = "poca"
+
+
+class MemoryKind(Enum):
+    """The memory of a network."""
+
+    none = "none"
+    lstm = "lstm"
+    gru = "gru"
+
+
+class RatioKind(Enum):
+    """What the probability ratio is taken of and clipped for."""
+
+    joint = "joint"
+    component = "component"
+
+
+class EntropyKind(Enum):
+    """How the entropies of continuous columns become one."""
+
+    sum = "sum"
+    mean = "mean"
+
+
+class ValueNormUpdate(Enum):
+    """When the statistics of returns move."""
+
+    batch = "batch"
+    minibatch = "minibatch"
 
 
 class WeightInit(Enum):
@@ -210,6 +240,15 @@ class EnvConfig:
                     )
 
 
+LOG_STD_RANGE = (-5, 2)
+"""Of the logarithm of the standard deviation of continuous actions, before the division by 3."""
+
+
+def bounded_log_std(value: float) -> float:
+    """Return the value in `LOG_STD_RANGE` of the same effect as an older run's, which might lie beyond."""
+    return min(max(value, LOG_STD_RANGE[0]), LOG_STD_RANGE[1])
+
+
 @dataclass
 class ModelConfig:
     """The actor's and the critic's networks."""
@@ -222,7 +261,8 @@ class ModelConfig:
     """Nonlinearity between hidden layers."""
     critic: CriticKind = CriticKind.central
     """What an agent's critic sees: its own observation (local: IPPO), its team's concatenated (central:
-    MAPPO), or its team's pooled (mean, attention: for teams whose size varies)."""
+    MAPPO), or its team's pooled (mean, attention: for teams whose size varies). poca: MA-POCA's value of the
+    team, and a baseline for each member that knows its mates' actions."""
     share_parameters: bool = True
     """One network for all members of a team; false: one for each member."""
     flatten_branches: bool = False
@@ -240,9 +280,14 @@ class ModelConfig:
     action_distribution: DistributionKind = DistributionKind.gaussian
     """Continuous actions: a Gaussian that the environment clips, its deviation a weight of its own
     (gaussian), or a Gaussian squashed by tanh, its deviation an output of the network (tanh_normal)."""
+    memory: MemoryKind = MemoryKind.none
+    """Memory of the actor and the critic: lstm or gru, one layer before the heads; none: they see the newest
+    observation only."""
+    memory_size: int = 128
+    """Width of the memory's state (as in ML-Agents: an LSTM's hidden and cell state are half as wide)."""
     init_log_std: float = 0.0
     """Logarithm of the initial standard deviation of continuous actions (before the division by 3; with
-    tanh_normal before tanh)."""
+    tanh_normal before tanh), from -5 to 2, where training keeps it."""
 
     def __post_init__(self) -> None:
         # null and [] mean model.hidden, which is checked itself
@@ -256,7 +301,24 @@ class ModelConfig:
                     f"for example {option}=[128,128]"
                 )
 
-        _within("model.init_log_std", self.init_log_std, -10, 3)
+        _at_least("model.memory_size", self.memory_size, 1)
+        if self.memory is MemoryKind.lstm and self.memory_size % 2:
+            raise ConfigError(
+                f"model.memory_size={self.memory_size} must be even with model.memory=lstm: half of it is "
+                f"the hidden state, half the cell state; model.memory_size={self.memory_size + 1}"
+            )
+        if self.memory is not MemoryKind.none and not self.share_parameters:
+            raise ConfigError(
+                f"model.memory={self.memory.value} needs model.share_parameters=true: networks of each "
+                "member of a team have no memory yet"
+            )
+
+        if self.critic is CriticKind.poca and not self.share_parameters:
+            raise ConfigError(
+                "model.critic=poca needs model.share_parameters=true: its value is the whole team's"
+            )
+
+        _within("model.init_log_std", self.init_log_std, *LOG_STD_RANGE)
 
 
 @dataclass
@@ -269,6 +331,10 @@ class PPOConfig:
     """How the learning rate falls to ppo.lr_final over max_steps."""
     lr_final: float = 0.0
     """Learning rate at the end of its schedule."""
+    critic_lr: Optional[float] = None
+    """Learning rate of the critic at the start, with the schedule of ppo.lr; null: as ppo.lr."""
+    separate_optimizers: bool = False
+    """Clip the gradients of actor and critic apart, as two optimizers would; false: one norm over both."""
     optimizer: Optimizer = Optimizer.adam
     """Optimizer of the networks."""
     weight_decay: float = 0.0
@@ -283,10 +349,15 @@ class PPOConfig:
     """How the clipping interval falls to ppo.clip_epsilon_final over max_steps."""
     clip_epsilon_final: float = 0.1
     """Clipping interval at the end of its schedule."""
+    ratio: RatioKind = RatioKind.joint
+    """The probability ratio that is clipped: of the whole action (joint), or of each continuous column and
+    each branch by itself, averaged (component, as ML-Agents)."""
     epochs: int = 3
     """Passes over a batch."""
     minibatch_size: int = 1024
-    """Agent decisions (agent slots of whole team rows) in a minibatch."""
+    """Agent decisions in a minibatch, about; an epoch has as many minibatches as come nearest to it."""
+    sequence_length: int = 64
+    """With model.memory: decisions of an agent that are learnt in a row."""
     num_minibatches: Optional[int] = None
     """Minibatches of an epoch, instead of ppo.minibatch_size; null: as that says."""
     entropy_coef: float = 0.0
@@ -295,6 +366,8 @@ class PPOConfig:
     """How the entropy weight falls to ppo.entropy_coef_final over max_steps."""
     entropy_coef_final: float = 0.0
     """Entropy weight at the end of its schedule."""
+    entropy: EntropyKind = EntropyKind.sum
+    """How the entropies of continuous columns become one: their sum, or their mean (as ML-Agents)."""
     value_coef: float = 0.5
     """Weight of the value loss."""
     value_loss: ValueLoss = ValueLoss.huber
@@ -308,6 +381,8 @@ class PPOConfig:
     when they move, so that its values stay what they were."""
     value_norm_beta: float = 0.99
     """Decay, for each batch, of the running statistics of returns."""
+    value_norm_update: ValueNormUpdate = ValueNormUpdate.batch
+    """When these statistics move: once for each batch, or with each minibatch (the MAPPO paper's code)."""
     reward_weight: float = 1.0
     """Weight of an agent's individual reward."""
     group_reward_weight: float = 1.0
@@ -316,8 +391,8 @@ class PPOConfig:
     """A member that ended while its team plays on keeps earning the team's reward until the team ends."""
     normalize_advantages: bool = True
     """Normalise advantages over the acting agents of a batch."""
-    max_grad_norm: float = 0.5
-    """Gradients are scaled down to this norm."""
+    max_grad_norm: Optional[float] = 0.5
+    """Gradients are scaled down to this norm; null: never (ML-Agents)."""
     target_kl: Optional[float] = None
     """Stop an update's remaining epochs when the approximate KL exceeds this; null: never."""
     max_kl: float = 1.0
@@ -325,6 +400,8 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         _above("ppo.lr", self.lr, 0)
+        _above("ppo.critic_lr", self.critic_lr, 0)
+        _at_least("ppo.sequence_length", self.sequence_length, 1)
         _at_least("ppo.lr_final", self.lr_final, 0)
         _at_least("ppo.weight_decay", self.weight_decay, 0)
         _within("ppo.gamma", self.gamma, 0, 1)
@@ -345,6 +422,14 @@ class PPOConfig:
         _above("ppo.max_grad_norm", self.max_grad_norm, 0)
         _above("ppo.target_kl", self.target_kl, 0)
         _above("ppo.max_kl", self.max_kl, 0)
+        if (
+            self.value_norm_update is ValueNormUpdate.minibatch
+            and self.normalize_values is ValueNormKind.popart
+        ):
+            raise ConfigError(
+                "ppo.value_norm_update=minibatch does not go with ppo.normalize_values=popart, which "
+                "rescales the critic once for each batch; give ppo.normalize_values=running"
+            )
 
 
 @dataclass
@@ -363,7 +448,11 @@ class CollectConfig:
 
 @dataclass
 class MatchConfig:
-    """Matches against a random side while training, for environments with two sides."""
+    """Matches against a random side while training, for environments with two sides.
+
+    They choose best.pt: by the lower end of Wilson's 95 % interval for the share of the points that the
+    newest four series won together, draws counted half.
+    """
 
     interval: Optional[int] = None
     """Agent decisions between two series of matches, with one more when max_steps are done; null: none."""

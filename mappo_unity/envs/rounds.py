@@ -14,24 +14,16 @@ without acting, earns what its team earns, and is done when the team's episode i
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps
 
+from mappo_unity.envs.ends import RoundEnds
+from mappo_unity.envs.group_rewards import GroupRewards
+from mappo_unity.envs.returns import Episode as Episode
+from mappo_unity.envs.returns import Returns
 from mappo_unity.envs.slots import SlotTable
 from mappo_unity.scenes.contract.rules import EnvironmentDataError as EnvironmentDataError
-
-
-class Episode(NamedTuple):
-    """A finished episode of one agent, as the environment reported it."""
-
-    agent_id: int
-    individual_return: float
-    group_return: float
-    length: int  # decisions
-    interrupted: bool
-    group_id: int = 0  # 0 = alone
 
 
 @dataclass
@@ -43,23 +35,27 @@ class BehaviorState:
     slots: SlotTable
     death_masking: bool = True
     obs: list[np.ndarray] = field(init=False)  # float32 [N, *shape]: newest observation of a slot
-    end_obs: list[np.ndarray] = field(init=False)  # the same, but the terminal one where the round ended
+    end_obs: list[np.ndarray] = field(init=False)  # the same, but the terminal one where an episode ended
+    end_present: np.ndarray = field(init=False)  # bool [N]: `present`, as of its end where one ended
+    end_departed: np.ndarray = field(init=False)  # likewise
     mask: np.ndarray = field(init=False)  # bool [N, sum of branches], True = allowed
 
     def __post_init__(self) -> None:
         count = self.slots.num_teams * self.slots.team_size
-        self.obs = [np.zeros((count, *o.shape), np.float32) for o in self.spec.observation_specs]
+        self._shapes = [tuple(o.shape) for o in self.spec.observation_specs]
+        self.obs = [np.zeros((count, *shape), np.float32) for shape in self._shapes]
         self.mask = np.ones((count, sum(self.spec.action_spec.discrete_branches)), bool)
 
         self.acting = np.zeros(count, bool)
+        self.first = np.zeros(count, bool)
         self.present = np.zeros(count, bool)
         self.departed = np.zeros(count, bool)
         self.order = np.zeros(0, np.int64)  # slots in the order of the last DecisionSteps
 
-        self.individual_return = np.zeros(count)
-        self.group_return = np.zeros(count)
-        self.length = np.zeros(count, np.int64)
-        self.finished: list[Episode] = []
+        self.returns = Returns(count)
+        self.group_rewards: GroupRewards | None = None  # of teams whose members depart
+        if self.death_masking and self.slots.team_size > 1:
+            self.group_rewards = GroupRewards(self.slots.num_teams, self.slots.team_size)
 
         self.begin_round()
 
@@ -72,9 +68,10 @@ class BehaviorState:
         self.terminated = np.zeros(count, bool)
         self.truncated = np.zeros(count, bool)
         self.acting = np.zeros(count, bool)
+        self.first = np.zeros(count, bool)  # acting, and the first decision of its agent's episode
         self.crashed = np.zeros(count, bool)  # slots whose episode `mark_crashed` named in this round
         self.order = np.zeros(0, np.int64)
-        self._terminal_obs: list[tuple[np.ndarray, list[np.ndarray]]] = []
+        self._ends = RoundEnds()
 
     def add(self, decision: DecisionSteps, terminal: TerminalSteps) -> None:
         """Take one result in: first the ends, then the new decisions."""
@@ -96,19 +93,21 @@ class BehaviorState:
         self.crashed |= self.departed & np.repeat(teams, self.slots.team_size)
 
     def end_round(self) -> None:
-        """Fix `end_obs`: the terminal observation where an episode ended, else the newest."""
+        """Fix `end_obs` and its flags: as of the terminal observation where an episode ended, else now."""
         # copies: these are handed out, while `obs` is written into again
         self.end_obs = [o.copy() for o in self.obs]
-        for rows, observations in self._terminal_obs:
-            for own, new in zip(self.end_obs, observations):
-                own[rows] = new
+        self.end_present, self.end_departed = self.present.copy(), self.departed.copy()
+
+        self._ends.write(self.end_obs, self.end_present, self.end_departed)
 
     def forget_agents(self) -> None:
         """Begin anew after a reset of the whole scene: episodes are cut, nobody acts yet."""
         self.slots.ended[:] = True
         self.present[:] = False
         self.departed[:] = False
-        self.individual_return[:] = self.group_return[:] = self.length[:] = 0
+        self.returns.forget()
+        if self.group_rewards is not None:
+            self.group_rewards.forget()
         self.begin_round()
 
     def actions(self, action: np.ndarray, limit: float) -> ActionTuple:
@@ -150,21 +149,20 @@ class BehaviorState:
         interrupted = terminal.interrupted[own]
         self.reward[rows] += terminal.reward[own]
         self.group_reward[rows] += terminal.group_reward[own]
-        self._finish_episodes(rows, terminal.reward[own], terminal.group_reward[own], interrupted)
+        self.returns.add(rows, terminal.reward[own], terminal.group_reward[own])
+        # an episode that a crash cut off says nothing about the policy
+        self.returns.finish(rows, self.slots.agents_of(rows), interrupted, drop=self.crashed)
         self.slots.ended[rows] = True
         # before `_team_plays_on`, which counts who is present
         self.present[rows] = False
 
+        plays_on = self._team_plays_on(rows)
         # who ends while its team plays on departs: its slot stays, sees zeros and earns on
-        leaves = np.zeros(len(rows), bool)
-        if self.death_masking and self.slots.team_size > 1:
-            leaves = self._team_plays_on(rows) & ~interrupted
-            # before these depart too: they have received their group reward above
-            self._settle_departed(rows[~leaves], rows, terminal.group_reward[own])
-            self.departed[rows[leaves]] = True
-            self.present[rows[leaves]] = True
-            for o in self.obs:
-                o[rows[leaves]] = 0
+        leaves = plays_on & ~interrupted if self.death_masking else np.zeros(len(rows), bool)
+        # before these depart too: they have received their group reward above
+        self._share_group_reward(rows, terminal.group_reward[own], np.ones(len(rows), bool))
+        if np.count_nonzero(leaves):
+            self._depart(rows[leaves], [o[leaves] for o in observations])
 
         over = ~leaves
         ends = rows[over]
@@ -172,22 +170,23 @@ class BehaviorState:
         self.truncated[ends] = interrupted[over]
 
         # copies: an environment may write its next observations into the same arrays
-        self._terminal_obs.append((ends, [o[over] for o in observations]))
+        self._ends.playing(ends, [o[over] for o in observations])
+
+        if self.slots.team_size > 1 and np.count_nonzero(plays_on) < len(rows):
+            self._end_teams(rows[~plays_on], interrupted[~plays_on])
 
     def _add_decision(self, decision: DecisionSteps) -> None:
         slots = self.slots.assign(decision.agent_id, decision.group_id)
 
-        # an episode's return counts every reward, a row only what its action earned
-        self.individual_return[slots] += decision.reward
-        self.group_return[slots] += decision.group_reward
-        self.length[slots] += 1
+        self.returns.add(slots, decision.reward, decision.group_reward)
+        self.returns.length[slots] += 1
 
         goes_on = self.present[slots] & ~self.departed[slots]
+        self._share_group_reward(slots, decision.group_reward, goes_on)
         if np.count_nonzero(goes_on) == len(goes_on):
             earners, reward, group_reward = slots, decision.reward, decision.group_reward
         else:  # what a first decision brings was earned by no action
-            returns = slots[self.departed[slots]]
-            self.terminated[returns] = True  # it is back before its team ended: its old episode is over
+            self._end_departed(slots[self.departed[slots]])
             self.departed[slots] = False
             self.present[slots] = True
             self.slots.ended[slots] = False
@@ -197,9 +196,6 @@ class BehaviorState:
         self.reward[earners] += reward
         self.group_reward[earners] += group_reward
 
-        if np.count_nonzero(self.departed):
-            self._share_group_reward(slots, decision.group_reward)
-
         for own, new in zip(self.obs, decision.obs):
             own[slots] = new
         if self.mask.shape[1]:
@@ -208,66 +204,76 @@ class BehaviorState:
             self.mask[slots] = True if masks is None else ~np.concatenate(masks, axis=1)
 
         self.acting[slots] = True
+        self.first[slots] = self.returns.length[slots] == 1
         self.order = slots
-
-    def _finish_episodes(
-        self, rows: np.ndarray, reward: np.ndarray, group_reward: np.ndarray, interrupted: np.ndarray
-    ) -> None:
-        self.individual_return[rows] += reward
-        self.group_return[rows] += group_reward
-
-        for agent, slot, cut in zip(self.slots.agents_of(rows), rows.tolist(), interrupted.tolist()):
-            # an episode that a crash cut off says nothing about the policy
-            if self.crashed[slot]:
-                continue
-            returns = float(self.individual_return[slot]), float(self.group_return[slot])
-            self.finished.append(Episode(agent, *returns, int(self.length[slot]), bool(cut)))
-
-        self.individual_return[rows] = self.group_return[rows] = self.length[rows] = 0
 
     def _team_plays_on(self, rows: np.ndarray) -> np.ndarray:
         size = self.slots.team_size
         alive = (self.present & ~self.departed).reshape(-1, size).max(axis=1)
         return np.asarray(alive)[rows // size]
 
-    def _settle_departed(self, ends: np.ndarray, rows: np.ndarray, group_reward: np.ndarray) -> None:
-        """Members that departed earlier earn what this end brought, and end with their team."""
-        if not np.count_nonzero(self.departed):
+    def _depart(self, rows: np.ndarray, observations: list[np.ndarray]) -> None:
+        self.departed[rows] = True
+        self.present[rows] = True
+        self._ends.departing(rows, observations)
+        for o in self.obs:
+            o[rows] = 0
+
+    def _end_departed(self, rows: np.ndarray) -> None:
+        """End the old episodes of departed slots that begin anew before their team has ended."""
+        if len(rows):
+            self.terminated[rows] = True
+            self._ends.returning(rows, self._shapes)
+
+    def _end_teams(self, rows: np.ndarray, interrupted: np.ndarray) -> None:
+        """Members that departed earlier end with their team's last members `rows`, and as these do."""
+        size = self.slots.team_size
+        over, cut = np.zeros((2, self.slots.num_teams), bool)
+        over[rows // size] = True
+        cut[rows[interrupted] // size] = True
+
+        departed = np.flatnonzero(self.departed & np.repeat(over, size))
+        if len(departed):
+            self.truncated[departed] = cut[departed // size]
+            self.terminated[departed] = ~cut[departed // size]
+            self.departed[departed] = False
+            self.present[departed] = False
+            self._ends.departed(departed, self._shapes)
+        if self.group_rewards is not None:
+            self.group_rewards.end(over)
+
+    def _share_group_reward(self, slots: np.ndarray, reward: np.ndarray, known: np.ndarray) -> None:
+        """Give the departed what members of their team, `known` and new ones, report now."""
+        rewards = self.group_rewards
+        if rewards is None:
             return
-        self._share_group_reward(rows, group_reward)
+        if np.count_nonzero(known) < len(known):
+            rewards.join(slots[~known])
+        if rewards.changes_nothing(reward):
+            return
 
-        team_ended = np.zeros(self.slots.num_teams, bool)
-        team_ended[ends // self.slots.team_size] = True
-        over = self.departed & np.repeat(team_ended, self.slots.team_size)
-
-        self.terminated[over] = True
-        self.departed[over] = False
-        self.present[over] = False
-
-    def _share_group_reward(self, rows: np.ndarray, group_reward: np.ndarray) -> None:
-        """Give the departed what a team mate of theirs received as group reward just now."""
-        # Unity adds a group reward to every member: the first that reports stands for its team
-        teams, first = np.unique(rows // self.slots.team_size, return_index=True)
-
-        share = np.zeros(self.slots.num_teams, np.float32)
-        share[teams] = group_reward[first]
-
+        earned = rewards.report(slots, reward, known, self.present & ~self.departed)
         departed = np.flatnonzero(self.departed)
-        self.group_reward[departed] += share[departed // self.slots.team_size]
+        self.group_reward[departed] += earned[departed // self.slots.team_size]
 
-    _ARRAYS = (
-        *("acting", "present", "departed", "order", "mask"),
-        *("individual_return", "group_return", "length"),
-    )
+    _ARRAYS = ("acting", "first", "present", "departed", "order", "mask")
 
     def get_state(self) -> dict:
         """Return everything that a round begun after `set_state` needs."""
         state = {name: getattr(self, name).copy() for name in self._ARRAYS}
+        state |= self.returns.get_state()
+        if self.group_rewards is not None:
+            state |= self.group_rewards.get_state()
         return state | {"slots": self.slots.get_state(), "obs": [o.copy() for o in self.obs]}
 
     def set_state(self, state: dict) -> None:
         """Go back to a state that `get_state` returned."""
+        # older snapshots do not say whose decision is the first of an episode
+        state = {"first": state["acting"] & (state["length"] == 1)} | state
         for name in self._ARRAYS:
             setattr(self, name, np.array(state[name], getattr(self, name).dtype))
         self.obs = [np.array(o, np.float32) for o in state["obs"]]
+        self.returns.set_state(state)
+        if self.group_rewards is not None:
+            self.group_rewards.set_state(state)
         self.slots.set_state(state["slots"])

@@ -23,9 +23,11 @@ def make_specs(
         shape = torch.Size((behavior.slots.num_teams, behavior.slots.team_size))
 
         entries: dict[str, Any] = {
-            keys.SENSOR.format(i): Unbounded((*shape, *o.shape[1:])) for i, o in enumerate(behavior.obs)
+            # arrays hold slots as [N, ...], entries as [G, A, ...]
+            keys.SENSOR.format(i): Unbounded((*shape, *o.shape[1:]))
+            for i, o in enumerate(behavior.obs)
         }
-        for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED):
+        for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED, keys.FIRST):
             entries[key] = Binary(1, (*shape, 1), dtype=torch.bool)
 
         # without discrete actions there is nothing to mask

@@ -21,7 +21,7 @@ def root_entries(behavior: BehaviorState) -> TensorDict:
     """Return what the agents are to act on now: entries as `reset` gives them, ends all False."""
     shape = slot_shape(behavior)
     # copies, because the behavior goes on writing into its newest observations
-    entries = _observe(behavior, [o.copy() for o in behavior.obs])
+    entries = _observe(behavior, [o.copy() for o in behavior.obs], behavior.present, behavior.departed)
 
     for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
         entries[key] = torch.zeros((*shape, 1), dtype=torch.bool)
@@ -29,9 +29,12 @@ def root_entries(behavior: BehaviorState) -> TensorDict:
 
 
 def next_entries(behavior: BehaviorState) -> TensorDict:
-    """Return what the last round brought: last observations, rewards and ends."""
+    """Return what the last round brought: last observations, rewards and ends.
+
+    Of a slot whose episode ended it says who was there then, not who holds the slot now.
+    """
     shape = slot_shape(behavior)
-    entries = _observe(behavior, behavior.end_obs)
+    entries = _observe(behavior, behavior.end_obs, behavior.end_present, behavior.end_departed)
 
     # no copies: `begin_round` makes new arrays
     for key, values in (
@@ -45,7 +48,9 @@ def next_entries(behavior: BehaviorState) -> TensorDict:
     return unchecked(entries, shape)
 
 
-def _observe(behavior: BehaviorState, observations: list[np.ndarray]) -> dict[str, torch.Tensor]:
+def _observe(
+    behavior: BehaviorState, observations: list[np.ndarray], present: np.ndarray, departed: np.ndarray
+) -> dict[str, torch.Tensor]:
     """Return the entries of the sensors, of the slots' flags, and the action mask where there is one."""
     shape = slot_shape(behavior)
     entries = {
@@ -53,10 +58,12 @@ def _observe(behavior: BehaviorState, observations: list[np.ndarray]) -> dict[st
         for i, o in enumerate(observations)
     }
 
+    # copies, because flags are written in place in later rounds
     for key, flags in (
         (keys.ACTING, behavior.acting),
-        (keys.PRESENT, behavior.present),
-        (keys.DEPARTED, behavior.departed),
+        (keys.PRESENT, present),
+        (keys.DEPARTED, departed),
+        (keys.FIRST, behavior.first),
     ):
         entries[key] = torch.from_numpy(flags.reshape(*shape, 1).copy())
 

@@ -85,7 +85,8 @@ class TransformedUnityEnv(TransformedEnv):
         if not all(type(transform) in (Stack, CatTensors, ExcludeTransform) for transform in transforms):
             return {}
 
-        beside = {keys.ACTION, keys.LOG_PROB, keys.DONE, keys.TERMINATED, keys.TRUNCATED}
+        written = {keys.ACTION, keys.LOG_PROB, keys.LOG_PROBS, keys.MEMORY}
+        beside = written | {keys.DONE, keys.TERMINATED, keys.TRUNCATED}
         return {name: beside.union(spec.keys()) for name, spec in self.observation_spec.items()}
 
 

@@ -78,7 +78,7 @@ class UnityEnv(EnvBase):
         specs = make_specs(self._behaviors, self.entry_of, self.action_limit)
         self.observation_spec, self.action_spec, self.reward_spec, self.done_spec = specs
 
-    # --- what a trainer asks for beyond EnvBase
+    # --- what a trainer needs beyond EnvBase
 
     sides: dict[str, list[str]]  # behaviors of every policy name
     entry_of: dict[str, str]  # behavior -> TensorDict entry: the policy name where it has one side only
@@ -90,11 +90,7 @@ class UnityEnv(EnvBase):
 
     def pop_episodes(self) -> dict[str, list[Episode]]:
         """Return the episodes that finished since the last call, a list for each behavior."""
-        out = {name: behavior.finished for name, behavior in self._behaviors.items()}
-        for behavior in self._behaviors.values():
-            behavior.finished = []
-
-        return out
+        return {name: behavior.returns.pop() for name, behavior in self._behaviors.items()}
 
     _crashed: list[CrashedEpisodes]
     rounds: int = 0  # rounds played since the environment was opened
@@ -249,6 +245,7 @@ class UnityEnv(EnvBase):
         self._checks = {name: seen.check for name, seen in first.items()}
 
         for name, sizes in team_sizes(first).items():
+            # in the order of `_limits`; a limit of the options wins over what is seen
             teams, members = (limit or seen for limit, seen in zip(self._limits, sizes))
             table = SlotTable(name, teams, members)
             behavior = BehaviorState(name, self._specs[name], table, self.death_masking)

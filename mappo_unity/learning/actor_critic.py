@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -17,14 +18,13 @@ from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
-from mappo_unity.config.schema import CriticKind, DistributionKind, ModelConfig
+from mappo_unity.config.schema import LOG_STD_RANGE, CriticKind, DistributionKind, MemoryKind, ModelConfig
 from mappo_unity.learning.critics import CentralCritic, LocalCritic, PooledCritic
 from mappo_unity.learning.distributions import ActionDistribution, ActionLayout, state_log_std
 from mappo_unity.learning.encoders import Encoder, ObsLayout
-from mappo_unity.learning.mlp import make_mlp
-from mappo_unity.learning.network_options import apply_options
-
-LOG_STD_RANGE = (-5.0, 2.0)
+from mappo_unity.learning.mlp import apply_options, init_head, make_mlp
+from mappo_unity.learning.poca import PocaCritic
+from mappo_unity.learning.recurrent import RecurrentActor, RecurrentCritic, output_size
 
 
 class Actor(nn.Module):
@@ -34,21 +34,21 @@ class Actor(nn.Module):
         super().__init__()
         self.encoder = Encoder(obs, cfg.normalize_obs)
 
-        # a squashed action's deviation depends on the state: one more output for each column
-        means = layout.continuous * (2 if layout.squashed else 1)
-        outputs = means + layout.num_logits
+        outputs = layout.num_means + layout.num_logits
         # the small last gain makes first actions almost independent of what is observed
         self.net = make_mlp(self.encoder.size, list(cfg.hidden), outputs, cfg.activation, last_gain=0.01)
 
         self.layout, self.init_log_std = layout, float(cfg.init_log_std)
-        apply_options(self, cfg, means)
+        apply_options(self, cfg, layout.num_means)
         if not layout.squashed:
             self.log_std = nn.Parameter(torch.full((layout.continuous,), self.init_log_std))
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return distribution parameters."""
-        out = self.net(self.encoder(*obs))
+        return self.complete(self.net(self.encoder(*obs)))
 
+    def complete(self, out: Tensor) -> Tensor:
+        """Put the standard deviations, which do not depend on observations, among the network's outputs."""
         size = self.layout.continuous
         if not size:
             return out
@@ -58,11 +58,22 @@ class Actor(nn.Module):
             log_std = state_log_std(out[..., size : 2 * size], self.init_log_std)
             return torch.cat([out[..., :size], log_std, out[..., 2 * size :]], -1)
 
-        log_std = self.log_std.clamp(*LOG_STD_RANGE).expand(*out.shape[:-1], size)
+        log_std = self._bounded_log_std().expand(*out.shape[:-1], size)
         if not self.layout.branches:
             return torch.cat([out, log_std], -1)
 
         return torch.cat([out[..., :size], log_std, out[..., size:]], -1)
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """Take the deviations back into their range, after a step of the optimizer."""
+        if not self.layout.squashed:
+            self.log_std.clamp_(*LOG_STD_RANGE)
+
+    def _bounded_log_std(self) -> Tensor:
+        bounded = self.log_std.clamp(*LOG_STD_RANGE).detach()
+        # `clamp` itself has no gradient outside its range: a deviation there could never come back
+        return bounded + (self.log_std - self.log_std.detach())
 
 
 class PerMember(nn.Module):
@@ -92,19 +103,32 @@ class PerMember(nn.Module):
         return torch.stack(columns, -2)
 
 
+class Draw(NamedTuple):
+    """What `UnityActor.draw` returns."""
+
+    action: Tensor  # [..., C + K]
+    log_prob: Tensor  # [...]
+    log_probs: Tensor | None  # [..., n], of the components, where the actor keeps them
+    memory: Tensor | None  # [..., M], the states after these decisions, where the actor has a memory
+
+
 class UnityActor(ProbabilisticActor):
-    """The policy of one policy name as a TorchRL actor, which can also give draws alone.
+    """The policy of one policy name as a TorchRL actor, which can also be asked for draws alone.
 
     Args:
         net: observation entries to the parameters ``[..., P]`` of an `ActionDistribution`.
         obs_keys: the entries that it reads, in its order.
         layout: the sizes of an action.
+
+    Attributes: `keeps_components`, whether draws hold the log-probabilities of an action's components, too.
     """
 
     def __init__(self, net: nn.Module, obs_keys: Sequence[str], layout: ActionLayout) -> None:
         in_keys = {"params": "params"} | ({"mask": keys.MASK} if layout.branches else {})
+        memory = net.memory if isinstance(net, RecurrentActor) else None
+        state = ([keys.MEMORY], [keys.MEMORY_AFTER]) if memory is not None else ([], [])
         super().__init__(
-            TensorDictModule(net, in_keys=list(obs_keys), out_keys=["params"]),
+            TensorDictModule(net, in_keys=[*obs_keys, *state[0]], out_keys=["params", *state[1]]),
             in_keys=in_keys,
             out_keys=[keys.ACTION],
             distribution_class=ActionDistribution,
@@ -114,21 +138,40 @@ class UnityActor(ProbabilisticActor):
             default_interaction_type=InteractionType.RANDOM,
         )
         self.obs_keys, self.layout = list(obs_keys), layout
+        self.memory_size: int = 0 if memory is None else memory.state_size
+        self.keeps_components = False
 
-    def draw(self, entries: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return random actions ``[..., C + K]`` and their log-probabilities ``[...]``, without gradients.
+    @property
+    def has_memory(self) -> bool:
+        """Whether actions depend on earlier observations."""
+        return self.memory_size > 0
 
-        The same numbers as `forward` writes in exploration; collecting calls this, because on small
-        networks the wrappers between `forward` and the network cost more than the network.
+    def draw(self, entries: TensorDictBase, deterministic: bool = False) -> Draw:
+        """Return actions and their log-probabilities, without gradients.
+
+        The same numbers as `forward` writes; collecting asks here, because on small networks the wrappers
+        between `forward` and the network cost more than the network.
         """
         with torch.no_grad():
-            # the network itself, inside its TensorDictModule
-            params = self.module[0].module(*[entries.get(key) for key in self.obs_keys])
-            mask = entries.get(keys.MASK) if self.layout.branches else None
+            inputs = [entries.get(key) for key in self.obs_keys]
+            after = None
+            if self.has_memory:
+                params, after = self.module[0].module(*inputs, entries.get(keys.MEMORY))
+            else:
+                params = self.module[0].module(*inputs)
 
+            mask = entries.get(keys.MASK) if self.layout.branches else None
             dist = ActionDistribution(params, self.layout, mask)
-            action = dist.sample()
-            return action, dist.log_prob(action)
+            action = dist.mode if deterministic else dist.sample()
+            parts = dist.component_log_probs(action) if self.keeps_components else None
+            return Draw(action, dist.log_prob(action), parts, after)
+
+
+def project(policy: nn.Module) -> None:
+    """Take the deviations of all actors of a policy back into their range."""
+    for module in policy.modules():
+        if isinstance(module, Actor):
+            module.project()
 
 
 def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig) -> UnityActor:
@@ -138,57 +181,81 @@ def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelC
 
     if cfg.share_parameters or team_size == 1:
         net: nn.Module = Actor(obs, layout, cfg)
+        if cfg.memory is not MemoryKind.none:
+            net = RecurrentActor(net, cfg)
+            init_head(net.head, cfg, layout.num_means)
     else:
         net = PerMember([Actor(obs, layout, cfg) for _ in range(team_size)], obs.team_dims)
     return UnityActor(net, obs.keys, layout)
 
 
-def make_critic(obs: ObsLayout, team_size: int, cfg: ModelConfig) -> TensorDictModule:
-    """Build the critic over the entries of one policy name; a team of one has a local one."""
+def make_critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: ActionLayout) -> TensorDictModule:
+    """Build the critic over the entries of one policy name; a team of one has a local one.
+
+    Args:
+        obs: the observation entries of an agent.
+        team_size: slots of a team.
+        cfg: the networks' options.
+        layout: the sizes of an action, which MA-POCA's baseline reads.
+    """
     local = team_size == 1 or cfg.critic is CriticKind.local
     in_keys = list(obs.keys) if local else [*obs.keys, keys.PRESENT, keys.DEPARTED]
 
     if cfg.share_parameters or team_size == 1:
-        net = _critic(obs, team_size, cfg)
+        net = _critic(obs, team_size, cfg, layout)
+        if cfg.memory is not MemoryKind.none:
+            net = RecurrentCritic(net, cfg, sees_team=not local)
+            init_head(net.value_heads[0], cfg)
     else:
-        nets = [_critic(obs, team_size, cfg) for _ in range(team_size)]
+        nets = [_critic(obs, team_size, cfg, layout) for _ in range(team_size)]
         net = PerMember(nets, obs.team_dims if local else None)
 
     return TensorDictModule(net, in_keys=in_keys, out_keys=[keys.VALUE])
 
 
-def _critic(obs: ObsLayout, team_size: int, cfg: ModelConfig) -> nn.Module:
+def _critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: ActionLayout) -> nn.Module:
     if team_size == 1 or cfg.critic is CriticKind.local:
         net: nn.Module = LocalCritic(obs, cfg)
     elif cfg.critic is CriticKind.central:
         net = CentralCritic(obs, team_size, cfg)
-    else:
+    elif cfg.critic is not CriticKind.poca:
         net = PooledCritic(obs, team_size, cfg)
+    else:
+        net = PocaCritic(obs, layout, team_size, cfg, head_size=output_size(cfg))
     return apply_options(net, cfg)
 
 
 class JointPolicy(TensorDictModuleBase):
-    """The actors of all policy names as one policy for the collector."""
+    """The actors of all policy names as one policy for the collector; it keeps the agents' memories."""
 
     def __init__(self, actors: dict[str, TensorDictModuleBase]) -> None:
         super().__init__()
-        # by number: a module's name may hold no dot, a policy's may
         self.actors = nn.ModuleDict({str(i): actor for i, actor in enumerate(actors.values())})
 
         self.names = list(actors)
-        self.inputs = [[str(k) for k in actor.in_keys] for actor in actors.values()]
+        self.inputs = [[str(k) for k in actor.in_keys if k != keys.MEMORY] for actor in actors.values()]
         self.in_keys = [(name, k) for name, inputs in zip(self.names, self.inputs) for k in inputs]
         self.out_keys = [(n, k) for n in actors for k in (keys.ACTION, keys.LOG_PROB)]
+        self.memories: dict[str, Tensor] = {}  # states [..., A, M] before the next decisions
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write every name's action and log-probability beside its observation."""
-        # only then are the actor's draws what its `forward` would write
         draws = exploration_type() in (None, ExplorationType.RANDOM) and not torch.is_grad_enabled()
 
         for name, inputs, actor in zip(self.names, self.inputs, self.actors.values()):
             entries = tensordict.get(name)
-            if draws and isinstance(actor, UnityActor):
-                action, log_prob = actor.draw(entries)
+            if isinstance(actor, UnityActor) and actor.has_memory:
+                entries.set(keys.MEMORY, self._memory(name, actor.memory_size, entries))
+
+            if isinstance(actor, UnityActor) and (draws or actor.has_memory):
+                drawn = actor.draw(entries, deterministic=not draws)
+                action, log_prob = drawn.action, drawn.log_prob
+                if drawn.log_probs is not None:
+                    entries.set(keys.LOG_PROBS, drawn.log_probs)
+                if drawn.memory is not None:
+                    # frozen while an agent is not asked
+                    acting, before = entries.get(keys.ACTING), entries.get(keys.MEMORY)
+                    self.memories[name] = torch.where(acting, drawn.memory, before)
             else:
                 out = actor(entries.select(*inputs, strict=False))
                 action, log_prob = out.get(keys.ACTION), out.get(keys.LOG_PROB)
@@ -197,3 +264,11 @@ class JointPolicy(TensorDictModuleBase):
             entries.set(keys.LOG_PROB, log_prob)
 
         return tensordict
+
+    def _memory(self, name: str, size: int, entries: TensorDictBase) -> Tensor:
+        """Return the states under which agents act now: zero at an agent's first decision."""
+        first = entries.get(keys.FIRST)
+        memory = self.memories.get(name)
+        if memory is None or memory.shape[:-1] != first.shape[:-1]:
+            return torch.zeros(*first.shape[:-1], size, device=first.device)
+        return torch.where(first, 0.0, memory)

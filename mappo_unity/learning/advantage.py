@@ -21,10 +21,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from mappo_unity.config.schema import Schedule
+from mappo_unity.learning.decisions import DecisionView
 
 
 class Advantage(NamedTuple):
@@ -57,59 +59,49 @@ def masked_gae(
         final_value, final_valued: ``[...]``, value and mask of the row after the last.
         valued_T, terminated_T, truncated_T: bool ``[T, ...]``.
     """
-    ended_T = terminated_T | truncated_T
-    end_value_T = torch.where(truncated_T, end_value_T, 0.0)  # of a real end it is 0
-
-    advantage_T, known_T = _walk_back(
-        *(reward_T, value_T, end_value_T, final_value, valued_T, final_valued, ended_T),
-        gamma=gamma,
-        gae_lambda=gae_lambda,
+    view = make_view(valued_T, final_valued, terminated_T | truncated_T)
+    return estimate(
+        view, reward_T, value_T, end_value_T, final_value, truncated_T, gamma=gamma, gae_lambda=gae_lambda
     )
-    target_T = torch.where(known_T, advantage_T + value_T, 0.0)
-    return Advantage(advantage_T, target_T, known_T)
 
 
-def _walk_back(
+def make_view(valued_T: Tensor, final_valued: Tensor, ended_T: Tensor) -> DecisionView:
+    """Return the decision view of masks ``[T, ...]`` and of the mask ``[...]`` of the row after the last."""
+    return DecisionView.of(_flat(valued_T), _row(final_valued), _flat(ended_T))
+
+
+def estimate(
+    view: DecisionView,
     reward_T: Tensor,
     value_T: Tensor,
     end_value_T: Tensor,
     final_value: Tensor,
-    valued_T: Tensor,
-    final_valued: Tensor,
-    ended_T: Tensor,
+    truncated_T: Tensor,
     *,
     gamma: float,
     gae_lambda: float,
-) -> tuple[Tensor, Tensor]:
-    """Return the advantages, and which of them are known, from the last row to the first."""
-    advantage_T = torch.zeros_like(value_T)
-    known_T = torch.zeros_like(valued_T)
+) -> Advantage:
+    """Do the same for a view of the batch that stands already: each reward signal has its own values."""
+    value = _flat(value_T)
+    following = view.next_values(value, _row(final_value), _flat(end_value_T), _flat(truncated_T))
+    delta = view.rewards(_flat(reward_T)) + np.float32(gamma) * following - value
+    advantage = view.scan(delta, gamma * gae_lambda)
+    target = np.where(view.known, advantage + value, np.float32(0))
 
-    # what the rows after t hand back to row t; `waiting` is the reward since the last row with a value
-    zero = torch.zeros_like(final_value)
-    next_value, next_advantage, waiting = final_value, zero, zero
-    known = final_valued.clone()
+    def back(values: np.ndarray) -> Tensor:
+        return torch.from_numpy(values).view(value_T.shape).to(value_T.device)
 
-    for t in range(len(reward_T) - 1, -1, -1):
-        ended, valued = ended_T[t], valued_T[t]
+    return Advantage(back(advantage), back(target), back(view.known))
 
-        # an end lets nothing of the next episode through
-        waiting = reward_T[t] + torch.where(ended, zero, waiting)
-        next_value = torch.where(ended, end_value_T[t], next_value)
-        next_advantage = torch.where(ended, zero, next_advantage)
-        known = known | ended
 
-        row = waiting + gamma * next_value - value_T[t] + gamma * gae_lambda * next_advantage
-        known_T[t] = valued & known
-        advantage_T[t] = torch.where(known_T[t], row, zero)
+def _flat(values: Tensor) -> np.ndarray:
+    """Return ``[T, ...]`` as an array ``[T, N]``."""
+    return values.cpu().numpy().reshape(len(values), -1)
 
-        # rounds without a value pass on what they got
-        next_advantage = torch.where(valued, advantage_T[t], next_advantage)
-        next_value = torch.where(valued, value_T[t], next_value)
-        waiting = torch.where(valued, zero, waiting)
-        known = known | valued
 
-    return advantage_T, known_T
+def _row(values: Tensor) -> np.ndarray:
+    """Return ``[...]`` as an array ``[N]``."""
+    return values.cpu().numpy().reshape(-1)
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:

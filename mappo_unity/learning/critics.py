@@ -19,7 +19,20 @@ ATTENTION_HEADS = 4
 CRITIC_GAIN = 0.01  # first values near 0: whatever the scale of returns, they are no noise to be unlearned
 
 
-class LocalCritic(nn.Module):
+class Critic(nn.Module):
+    """A network that ends in the linear layer `head`, whose outputs are values."""
+
+    net: nn.Sequential
+
+    @property
+    def head(self) -> nn.Linear:
+        """Return the layer that gives values, which PopArt rescales."""
+        head = self.net[-1]
+        assert isinstance(head, nn.Linear)
+        return head
+
+
+class LocalCritic(Critic):
     """Observation entries ``[..., A, *]`` to values ``[..., A, 1]``, each member by itself."""
 
     def __init__(self, obs: ObsLayout, cfg: ModelConfig) -> None:
@@ -33,7 +46,7 @@ class LocalCritic(nn.Module):
         return self.net(self.encoder(*obs))
 
 
-class CentralCritic(nn.Module):
+class CentralCritic(Critic):
     """The whole team's observations, who is there and whom it judges, to values ``[..., A, 1]``.
 
     The judged member enters as a one-hot index; its columns of the first layer are `member`, so that
@@ -57,7 +70,7 @@ class CentralCritic(nn.Module):
         return self.net(self.activation(joint.unsqueeze(-2) + self.member))
 
 
-class PooledCritic(nn.Module):
+class PooledCritic(Critic):
     """A member's own features, its team's pooled and how many there are, to values ``[..., A, 1]``."""
 
     def __init__(self, obs: ObsLayout, team_size: int, cfg: ModelConfig) -> None:

@@ -61,6 +61,11 @@ class ActionLayout:
         return sum(self.categoricals)
 
     @property
+    def num_means(self) -> int:
+        """Number of a network's outputs for continuous columns: squashed ones have a deviation each, too."""
+        return self.continuous * (2 if self.squashed else 1)
+
+    @property
     def num_params(self) -> int:
         """Length P of the parameters: means, logarithms of deviations, logits."""
         return 2 * self.continuous + self.num_logits
@@ -159,11 +164,28 @@ class ActionDistribution(Distribution):
 
         return total
 
-    def entropy(self) -> Tensor:
-        """Return the entropy ``[...]``, summed over columns and branches."""
+    def component_log_probs(self, value: Tensor) -> Tensor:
+        """Return log-probabilities ``[..., C + K]`` of actions, of each column and each branch by itself.
+
+        With `ActionLayout.joint` the branches are one component.
+        """
+        size = self.layout.continuous
+        parts = [self._column_log_probs(value[..., :size])] if size else []
+        if self.log_probs:
+            categories = self.layout.to_categories(value[..., size:].long())
+            parts += [p.gather(-1, categories[..., i : i + 1]) for i, p in enumerate(self.log_probs)]
+        return torch.cat(parts, -1)
+
+    def entropy(self, mean: bool = False) -> Tensor:
+        """Return the entropy ``[...]``, summed over columns and branches.
+
+        Args:
+            mean: take the mean over the continuous columns, and add the branches to it (ML-Agents).
+        """
         total = torch.zeros(())
         if self.layout.continuous:
-            total = (self.log_std + 0.5 + _LOG_SQRT_2PI + self._mean_log_slope()).sum(-1)
+            columns = self.log_std + 0.5 + _LOG_SQRT_2PI + self._mean_log_slope()
+            total = columns.mean(-1) if mean else columns.sum(-1)
 
         for log_probs in self.log_probs:
             total = total - (log_probs.exp() * log_probs).sum(-1)
@@ -194,13 +216,16 @@ class ActionDistribution(Distribution):
         return sum(w * _log_slope(self.loc + std * x) for x, w in zip(_NODES, _WEIGHTS))
 
     def _continuous_log_prob(self, value: Tensor) -> Tensor:
+        return self._column_log_probs(value).sum(-1)
+
+    def _column_log_probs(self, value: Tensor) -> Tensor:
         slope: Tensor | float = 0.0
         if self.layout.squashed:
             value = (value / CONTINUOUS_LIMIT).clamp(-TANH_LIMIT, TANH_LIMIT).atanh()
             slope = _log_slope(value)
 
         z = (value - self.loc) * torch.exp(-self.log_std)
-        return (-0.5 * z * z - self.log_std - _LOG_SQRT_2PI - slope).sum(-1)
+        return -0.5 * z * z - self.log_std - _LOG_SQRT_2PI - slope
 
     def _sample_continuous(self, sample_shape: Sequence[int]) -> Tensor:
         shape = torch.Size(sample_shape) + self.loc.shape

@@ -1,70 +1,139 @@
-"""The loss of PPO over slots of which not all act: TorchRL's ClipPPOLoss with masks."""
+"""The loss of PPO over slots of which not all act: TorchRL's ClipPPOLoss with masks and ML-Agents' variants.
+
+ClipPPOLoss sets it up; `forward` is our own, since masks, ratios of an action's components, baselines and
+memories need another one, and TorchRL's wrappers cost more than small networks do.
+"""
 
 from __future__ import annotations
-
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.modules import ProbabilisticActor
+from torch.nn.functional import huber_loss
 from torchrl.objectives import ClipPPOLoss
 
 from mappo_unity import keys
-from mappo_unity.config.schema import PPOConfig, ValueLoss
+from mappo_unity.config.schema import EntropyKind, PPOConfig, RatioKind, ValueLoss
+from mappo_unity.learning.actor_critic import UnityActor
 from mappo_unity.learning.advantage import masked_mean
+from mappo_unity.learning.distributions import ActionDistribution
+from mappo_unity.learning.poca import PocaCritic
+from mappo_unity.learning.recurrent import RecurrentCritic
 
 ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: the slot acted and the outcome is known
 CRITIC_LEARNS = "critic_learns"  # bool [rows, A, 1]: the same, or its agent departed while a team mate acted
+BASELINE = "baseline"  # float32 [rows, A, 1]: what a POCA critic said before the update, normalised
+TEAM = "team"  # with memory: the critic's inputs of the whole team, [B, L, A, *]
+MEMBER = "member"  # with memory: int64 [B], the slot of the team whose decisions the sequence holds
+BASELINE_WEIGHT = 0.5  # of the baseline's loss beside the value's (ML-Agents, poca/optimizer_torch.py)
 
 
 class MaskedClipPPOLoss(ClipPPOLoss):
-    """ClipPPOLoss over the slots that acted, with a Huber threshold of choice.
+    """ClipPPOLoss over the slots that acted.
 
-    TorchRL's smooth_l1 has its knee at 1: dividing prediction and target by delta and multiplying
-    the loss by delta**2 gives the Huber loss with its knee at delta.
+    Args:
+        actor, critic: see `learning.actor_critic`.
+        cfg: the learner's options.
+
+    Attributes: `log_ratio` ``[..., n]`` and `entropy` ``[...]`` of the last call, without gradients.
     """
 
-    def __init__(self, actor: ProbabilisticActor, critic: TensorDictModule, cfg: PPOConfig) -> None:
-        self.huber_delta = cfg.huber_delta if cfg.value_loss is ValueLoss.huber else 1.0
+    def __init__(self, actor: UnityActor, critic: TensorDictModule, cfg: PPOConfig) -> None:
         super().__init__(
             actor,
             critic,
             clip_epsilon=cfg.clip_epsilon,
             entropy_coeff=cfg.entropy_coef,
-            critic_coeff=cfg.value_coef * self.huber_delta**2,
-            loss_critic_type="smooth_l1" if cfg.value_loss is ValueLoss.huber else "l2",
-            # `PolicyLearner` normalises over the batch, this would do so over a minibatch
+            critic_coeff=cfg.value_coef,
             normalize_advantage=False,
-            # values are divided by delta before they are clipped, see `_critic_loss_inputs`
-            clip_value=cfg.clip_epsilon / self.huber_delta if cfg.clip_value else None,
             functional=False,
         )
-        self.log_explained_variance = False
-        self.loss_mask_key = ACTOR_LEARNS
+        self.cfg = cfg
         self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
+        self._actor, self._critic = actor, critic.module
+        self.critic_keys = [str(key) for key in critic.in_keys]
         self.log_ratio = self.entropy = torch.zeros(())
 
-    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Tensor:
-        # TorchRL's own falls back to sampling when a number is not finite; here that is for `_update` to see
-        entropy = dist.entropy().unsqueeze(-1)
+    def forward(self, rows: TensorDictBase) -> dict[str, Tensor]:
+        """Return ``loss_objective``, ``loss_critic`` and ``loss_entropy``, scalars to be added.
+
+        Args:
+            rows: team rows ``[R, A]``; with a memory, sequences ``[B, L]`` of single agents.
+        """
+        clip, mask = self.clip_epsilon.item(), rows.get(ACTOR_LEARNS)
+        dist = self._distribution(rows)
+        self.log_ratio, ratio = self._ratio(dist, rows, mask)
+
+        advantage = rows.get(keys.ADVANTAGE)
+        gain = torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
+        entropy = dist.entropy(mean=self.cfg.entropy is EntropyKind.mean)
         self.entropy = entropy.detach()
-        return entropy
 
-    def loss_critic(self, tensordict: TensorDictBase) -> Any:
-        """Return the critic's loss over all slots with a value, in a shape that the mask of actions keeps."""
-        loss, *rest = super().loss_critic(tensordict)
-        return masked_mean(loss, tensordict.get(CRITIC_LEARNS)).expand(loss.shape), *rest
+        return {
+            "loss_objective": -masked_mean(gain.mean(-1, keepdim=True), mask),
+            "loss_critic": self.cfg.value_coef * self._critic_loss(rows, clip),
+            "loss_entropy": -self.entropy_coeff.item() * masked_mean(entropy.unsqueeze(-1), mask),
+        }
 
-    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> Any:
-        out = super()._log_weight(tensordict, adv_shape)
-        self.log_ratio = out[0].detach()
-        return out
+    def compare(self, rows: TensorDictBase) -> None:
+        """Set `log_ratio` to what the policy now makes of these rows, without the rest of the loss."""
+        self.log_ratio, _ = self._ratio(self._distribution(rows), rows, rows.get(ACTOR_LEARNS))
 
-    def _critic_loss_inputs(
-        self, target_return: Tensor, state_value: Tensor, old_state_value: Tensor | None
-    ) -> Any:
-        delta = self.huber_delta
-        old = None if old_state_value is None else old_state_value / delta
-        return target_return / delta, state_value / delta, old
+    def _distribution(self, rows: TensorDictBase) -> ActionDistribution:
+        obs = [rows.get(key) for key in self._actor.obs_keys]
+        net = self._actor.module[0].module
+        params = net.unroll(*obs, rows.get(keys.MEMORY)) if self._actor.has_memory else net(*obs)
+        mask = rows.get(keys.MASK) if self._actor.layout.branches else None
+        return ActionDistribution(params, self._actor.layout, mask)
+
+    def _ratio(self, dist: ActionDistribution, rows: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log-ratios (detached) and ratios ``[..., n]``: of the whole action, or of its components."""
+        if self.cfg.ratio is RatioKind.component:
+            new, old = dist.component_log_probs(rows.get(keys.ACTION)), rows.get(keys.LOG_PROBS)
+        else:
+            new, old = (
+                dist.log_prob(rows.get(keys.ACTION)).unsqueeze(-1),
+                rows.get(keys.LOG_PROB).unsqueeze(-1),
+            )
+
+        # what stands in rows that do not count may be anything
+        log_ratio = torch.where(mask, new - old, 0.0)
+        return log_ratio.detach(), log_ratio.exp()
+
+    def _critic_loss(self, rows: TensorDictBase, clip: float) -> Tensor:
+        mask, target = rows.get(CRITIC_LEARNS), rows.get(keys.VALUE_TARGET)
+        value, baseline = self._values(rows)
+
+        loss = self._distance(value, target, rows.get(keys.VALUE) if self.cfg.clip_value else None, clip)
+        loss = masked_mean(loss, mask)
+        if baseline is None:
+            return loss
+
+        # ML-Agents clips the baseline's move, and not the value's
+        beside = self._distance(baseline, target, rows.get(BASELINE), clip)
+        return loss + BASELINE_WEIGHT * masked_mean(beside, rows.get(ACTOR_LEARNS))
+
+    def _values(self, rows: TensorDictBase) -> tuple[Tensor, Tensor | None]:
+        """Return values, and baselines where the critic has them."""
+        critic = self._critic
+        if isinstance(critic, RecurrentCritic):
+            inputs = [rows.get((TEAM, key)) for key in self.critic_keys]
+            action = rows.get((TEAM, keys.ACTION)) if critic.has_baseline else None
+            return critic.unroll(inputs, action, rows.get(MEMBER), rows)
+
+        inputs = [rows.get(key) for key in self.critic_keys]
+        if not isinstance(critic, PocaCritic):
+            return critic(*inputs), None
+        return critic.value(*inputs), critic.baseline(*inputs, rows.get(keys.ACTION))
+
+    def _distance(self, value: Tensor, target: Tensor, old: Tensor | None, clip: float) -> Tensor:
+        loss = self._unclipped(value, target)
+        if old is None:
+            return loss
+        return torch.max(loss, self._unclipped(old + (value - old).clamp(-clip, clip), target))
+
+    def _unclipped(self, value: Tensor, target: Tensor) -> Tensor:
+        if self.cfg.value_loss is ValueLoss.huber:
+            return huber_loss(value, target, reduction="none", delta=self.cfg.huber_delta)
+        return (value - target) ** 2

@@ -13,56 +13,64 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.data.replay_buffers import SamplerWithoutReplacement
-from torchrl.modules import ProbabilisticActor
+from torchrl.data import ReplayBuffer
 
 from mappo_unity import keys
-from mappo_unity.config.schema import Optimizer, PPOConfig, ValueNormKind
-from mappo_unity.learning.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
+from mappo_unity.config.schema import Optimizer, PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
+from mappo_unity.learning.actor_critic import Actor, UnityActor
+from mappo_unity.learning.advantage import (
+    Advantage,
+    estimate,
+    explained_variance,
+    make_view,
+    masked_mean,
+    normalize,
+    scheduled,
+)
+from mappo_unity.learning.carried import VALUED, CarriedRounds
 from mappo_unity.learning.encoders import RunningNorm
-from mappo_unity.learning.loss import ACTOR_LEARNS, CRITIC_LEARNS, MaskedClipPPOLoss
+from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS, MaskedClipPPOLoss
+from mappo_unity.learning.minibatches import make_buffer
+from mappo_unity.learning.poca import PocaCritic
+from mappo_unity.learning.recurrent import RecurrentCritic
+from mappo_unity.learning.rows import SequenceRows, TeamRows
 from mappo_unity.learning.value_norm import ValueNorm
+from mappo_unity.learning.value_reader import ValueReader, Values
 
 
 class PolicyLearner:
     """Everything that learns for one policy name.
 
     Args:
-        actor, critic: see `learning.actor_critic`.
+        actor, critic: see `learning.actor_critic`; both have a memory, or neither.
         cfg: the learner's options.
-        max_rows: team rows of the largest batch.
-        team_size: slots of a row.
     """
 
-    def __init__(
-        self,
-        actor: ProbabilisticActor,
-        critic: TensorDictModule,
-        cfg: PPOConfig,
-        max_rows: int,
-        team_size: int,
-    ) -> None:
+    def __init__(self, actor: UnityActor, critic: TensorDictModule, cfg: PPOConfig) -> None:
         self.actor, self.critic, self.cfg = actor, critic, cfg
+        actor.keeps_components = cfg.ratio is RatioKind.component
         self.loss = MaskedClipPPOLoss(actor, critic, cfg)
+        self.optimizer = make_optimizer(actor, critic, cfg)
         self.params = [*actor.parameters(), *critic.parameters()]
-        self.optimizer = make_optimizer(self.params, cfg)
         self.value_norm = ValueNorm(cfg.value_norm_beta, cfg.normalize_values is not ValueNormKind.none)
+        self.reader = ValueReader(critic, self.value_norm)
 
-        self.critic_keys = [str(key) for key in critic.in_keys]
+        inputs = [str(key) for net in (actor, critic) for key in net.in_keys]
+        written = [keys.ACTION, keys.LOG_PROB] + [keys.LOG_PROBS] * actor.keeps_components
+        self.row_keys = list(dict.fromkeys([*inputs, *written]))
+        self.carried = CarriedRounds(self.row_keys + [keys.FIRST] * actor.has_memory)
+        self.rows = (
+            SequenceRows(self.row_keys, self.reader.keys, critic.module, cfg)
+            if actor.has_memory
+            else (TeamRows(self.row_keys))
+        )
+
         # the layers that give values, which PopArt rescales
-        self.value_layers = [m for m in critic.modules() if isinstance(m, nn.Linear) and m.out_features == 1]
-        inputs = [*(str(key) for key in actor.in_keys), *self.critic_keys]
-        self.row_keys = list(dict.fromkeys([*inputs, keys.ACTION, keys.LOG_PROB]))
-
+        self.value_layers = value_layers(critic)
+        self.has_baseline = any(isinstance(m, PocaCritic) for m in critic.modules())
+        self.bounded = [m for m in actor.modules() if isinstance(m, Actor)]
         self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
-
-        self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(max_rows),
-            sampler=SamplerWithoutReplacement(),
-            batch_size=minibatch_rows(cfg, max_rows, team_size),
-        )
 
     def learn(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Improve the networks by one batch.
@@ -75,8 +83,8 @@ class PolicyLearner:
             Metrics.
         """
         settings = self._set_schedules(progress)
-        rows, metrics = self._prepare(batch)
-        metrics |= self._update(rows) if len(rows) else {}
+        buffer, metrics = self.prepare(batch)
+        metrics |= self.update(buffer) if buffer is not None else {}
         self._update_norms(batch)
         return metrics | settings
 
@@ -86,65 +94,79 @@ class PolicyLearner:
         clip = scheduled(cfg.clip_schedule, cfg.clip_epsilon, cfg.clip_epsilon_final, progress)
         entropy = scheduled(cfg.entropy_schedule, cfg.entropy_coef, cfg.entropy_coef_final, progress)
 
-        for group in self.optimizer.param_groups:
-            group["lr"] = lr
+        # the actor's parameters, then the critic's
+        start = cfg.lr if cfg.critic_lr is None else cfg.critic_lr
+        critic_lr = scheduled(cfg.lr_schedule, start, cfg.lr_final, progress)
+        for group, rate in zip(self.optimizer.param_groups, (lr, critic_lr)):
+            group["lr"] = rate
         self.loss.clip_epsilon.fill_(clip)
         self.loss.entropy_coeff.fill_(entropy)
 
         return {"lr": lr, "clip_epsilon": clip, "entropy_coef": entropy}
 
     @torch.no_grad()
-    def _prepare(self, batch: TensorDictBase) -> tuple[TensorDictBase, dict[str, float]]:
-        """Add advantages and targets; return the team rows ``[R, A]`` in which anybody learns."""
+    def prepare(self, batch: TensorDictBase) -> tuple[ReplayBuffer | None, dict[str, float]]:
+        """Add advantages and targets; return a buffer of the rows that are learnt, None if there are none."""
         following = batch.get("next")
-        acting, truncated = batch.get(keys.ACTING), following.get(keys.TRUNCATED)
+        rounds = self.carried.join(batch)
+        values = self.reader.read(rounds, following)
 
-        value = self._values(batch)
-        estimate = masked_gae(
-            self.cfg.reward_weight * following.get(keys.REWARD)
-            + self.cfg.group_reward_weight * following.get(keys.GROUP_REWARD),
-            value,
-            self._end_values(following, truncated),
-            self._values(following[-1]),
-            has_value(batch),
-            has_value(following[-1]),
-            following.get(keys.TERMINATED),
-            truncated,
+        ended = rounds.get(keys.TERMINATED) | rounds.get(keys.TRUNCATED)
+        # an end cuts the way to the row after the last
+        view = make_view(rounds.get(VALUED), following.get(keys.ACTING)[-1] | _departed(following), ended)
+        gae = estimate(
+            view,
+            self._rewards(rounds),
+            values.value,
+            values.end,
+            values.final,
+            rounds.get(keys.TRUNCATED),
             gamma=self.cfg.gamma,
             gae_lambda=self.cfg.gae_lambda,
         )
+        self.carried.keep(rounds, view)
+        self.reader.keep(values, rounds.get(VALUED) & ~gae.known)
 
-        learns = estimate.known & acting
+        learns = gae.known & rounds.get(keys.ACTING)
         metrics = {
-            "explained_variance": float(explained_variance(value, estimate.target, learns)),
-            "value_mean": float(masked_mean(value, learns)),
+            "explained_variance": float(explained_variance(values.value, gae.target, learns)),
+            "value_mean": float(masked_mean(values.value, learns)),
         }
+        self._enter(rounds, values, gae, learns)
+        rows, decisions = self.rows.of(rounds, view)
+        return (make_buffer(rows, decisions, self.cfg) if len(rows) else None), metrics
 
-        # `value` was denormalised above, and is normalised below: the statistics move in between
-        self._move_value_norm(estimate.target[estimate.known])
+    def _rewards(self, rounds: TensorDict) -> Tensor:
+        """Return the weighted rewards of each round; MA-POCA's value is the team's, of all its rewards."""
+        own = self.cfg.reward_weight * rounds.get(keys.REWARD)
+        if self.has_baseline:
+            own = own.sum(-2, keepdim=True).expand_as(own)
+        return own + self.cfg.group_reward_weight * rounds.get(keys.GROUP_REWARD)
 
-        advantage = (
-            normalize(estimate.advantage, learns) if self.cfg.normalize_advantages else estimate.advantage
-        )
+    def _enter(self, rounds: TensorDict, values: Values, gae: Advantage, learns: Tensor) -> None:
+        """Set the entries that the loss reads beside inputs and actions."""
+        # values were denormalised, and are normalised below: the statistics move in between
+        by_minibatch = self.cfg.value_norm_update is ValueNormUpdate.minibatch
+        if not by_minibatch:
+            self._move_value_norm(gae.target[gae.known])
 
-        entries = {key: batch.get(key) for key in self.row_keys}
-        entries |= {keys.ADVANTAGE: advantage, keys.VALUE_TARGET: self.value_norm.normalize(estimate.target)}
-        entries |= {
-            ACTOR_LEARNS: learns,
-            CRITIC_LEARNS: estimate.known,
-            keys.VALUE: self.value_norm.normalize(value),
-        }
+        advantage = gae.advantage
+        if values.baseline is not None:
+            advantage = torch.where(gae.known, gae.target - values.baseline, 0.0)
+        if self.cfg.normalize_advantages:
+            advantage = normalize(advantage, learns)
 
-        # rows without an action to learn from would only dilute the minibatches
-        rows = TensorDict(entries, batch.batch_size).flatten(0, -2)
-        used = learns.flatten(0, -3).any(-2).squeeze(-1)
-        return (rows if bool(used.all()) else rows[used]), metrics
-
-    @torch.no_grad()
-    def _values(self, entries: TensorDictBase) -> Tensor:
-        """The critic's values in the reward's scale."""
-        out = self.critic(entries.select(*self.critic_keys))
-        return self.value_norm.denormalize(out.get(keys.VALUE))
+        # where the statistics move with each minibatch, it normalises these itself
+        scaled = (lambda x: x) if by_minibatch else self.value_norm.normalize
+        rounds.set(keys.ADVANTAGE, advantage)
+        rounds.set(keys.VALUE_TARGET, scaled(gae.target))
+        rounds.set(keys.VALUE, scaled(values.value))
+        if values.baseline is not None:
+            rounds.set(BASELINE, scaled(values.baseline))
+        for name, state in values.states.items():
+            rounds.set(name, state)
+        rounds.set(ACTOR_LEARNS, learns)
+        rounds.set(CRITIC_LEARNS, gae.known)
 
     @torch.no_grad()
     def _move_value_norm(self, returns: Tensor) -> None:
@@ -163,31 +185,17 @@ class PolicyLearner:
             layer.weight.mul_(std / new_std)
             layer.bias.mul_(std).add_(mean - new_mean).div_(new_std)
 
-    def _end_values(self, following: TensorDictBase, truncated: Tensor) -> Tensor:
-        """Values of terminal observations of cut episodes, 0 elsewhere."""
-        out = torch.zeros(truncated.shape, device=truncated.device)
-        where = truncated.flatten(0, -3).any(-2).squeeze(-1)
-
-        # the critic runs only on rows that need it
-        if where.any():
-            rows = following.select(*self.critic_keys).flatten(0, -2)[where]
-            out.flatten(0, -3)[where] = self._values(rows)
-
-        return out
-
-    def _update(self, rows: TensorDictBase) -> dict[str, float]:
+    def update(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Run the epochs; take everything back if a number is not finite or the KL explodes."""
         before = copy.deepcopy(self._trainable_state())
-
-        self.buffer.empty()
-        self.buffer.extend(rows)
 
         sums: dict[str, Tensor] = {}
         steps, kl_epoch, stopped = 0, 0.0, False
         for _ in range(self.cfg.epochs):
             kls = []
-            for minibatch in self.buffer:
-                terms = self._step(minibatch)
+            for minibatch in buffer:
+                minibatch = self.rows.take(minibatch)
+                terms = self.step(minibatch)
                 sums = {k: v + sums.get(k, 0.0) for k, v in terms.items()}
                 kls.append(terms["kl"])
                 steps += 1
@@ -200,44 +208,80 @@ class PolicyLearner:
                 stopped = True
                 break
 
+        # each step's KL is that before it: what the last one did is seen only now
+        kl_after = float(self._kl_after(minibatch))
         metrics = {name: float(value) / steps for name, value in sums.items()}
-        healthy = all(math.isfinite(v) for v in metrics.values()) and self._weights_finite()
+        healthy = all(map(math.isfinite, (*metrics.values(), kl_after))) and self._weights_finite()
 
         self.updates += 1
-        if not healthy or kl_epoch > self.cfg.max_kl:
+        rolled_back = not healthy or max(kl_epoch, kl_after) > self.cfg.max_kl
+        if rolled_back:
             self._load_trainable(before)
             self.rollbacks += 1
 
-        rolled = {"rolled_back": float(not healthy or kl_epoch > self.cfg.max_kl)}
-        return (
-            metrics
-            | rolled
-            | {"kl_last": kl_epoch, "kl_stopped": float(stopped), "rollbacks": float(self.rollbacks)}
-        )
+        return metrics | {
+            "rolled_back": float(rolled_back),
+            "kl_last": max(kl_epoch, kl_after) if healthy else kl_after,
+            "kl_stopped": float(stopped),
+            "rollbacks": float(self.rollbacks),
+        }
 
-    def _step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+    def step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """Take one step of the optimizer; return its terms, as they were before it."""
+        if self.cfg.value_norm_update is ValueNormUpdate.minibatch:
+            self._normalize_values(minibatch)
         losses = self.loss(minibatch)
         total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
 
         self.optimizer.zero_grad()
         total.backward()
-        grad_norm = nn.utils.clip_grad_norm_(self.params, self.cfg.max_grad_norm, foreach=True)
+        grad_norm = self._clip_gradients()
         self.optimizer.step()
+        for net in self.bounded:
+            net.project()
 
         with torch.no_grad():
             mask, log_ratio = minibatch.get(ACTOR_LEARNS), self.loss.log_ratio
-            # k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative
-            kl = masked_mean(torch.where(mask, log_ratio.exp() - 1 - log_ratio, 0.0), mask)
-            clipped = masked_mean((log_ratio.exp() - 1).abs() > self.loss.clip_epsilon, mask)
+            clipped = ((log_ratio.exp() - 1).abs() > self.loss.clip_epsilon.item()).float()
+            return {
+                "policy_loss": losses["loss_objective"].detach(),
+                "value_loss": losses["loss_critic"].detach(),
+                "entropy": masked_mean(self.loss.entropy.view(mask.shape), mask),
+                "kl": self._kl(mask),
+                "clip_fraction": masked_mean(clipped.mean(-1, keepdim=True), mask),
+                "grad_norm": grad_norm.detach(),
+            }
 
-        return {
-            "policy_loss": losses["loss_objective"].detach(),
-            "value_loss": losses["loss_critic"].detach(),
-            "entropy": masked_mean(self.loss.entropy.view(mask.shape), mask),
-            "kl": kl,
-            "clip_fraction": clipped,
-            "grad_norm": grad_norm.detach(),
-        }
+    def _kl(self, mask: Tensor) -> Tensor:
+        """Return the approximate KL of the last call of the loss."""
+        log_ratio = self.loss.log_ratio.sum(-1, keepdim=True)
+        # k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative
+        return masked_mean(torch.where(mask, log_ratio.exp() - 1 - log_ratio, 0.0), mask)
+
+    @torch.no_grad()
+    def _kl_after(self, minibatch: TensorDictBase) -> Tensor:
+        """Return the approximate KL on the last minibatch, now that its step is taken."""
+        self.loss.compare(minibatch)
+        return self._kl(minibatch.get(ACTOR_LEARNS))
+
+    def _clip_gradients(self) -> Tensor:
+        limit = math.inf if self.cfg.max_grad_norm is None else self.cfg.max_grad_norm
+        if not self.cfg.separate_optimizers:
+            return nn.utils.clip_grad_norm_(self.params, limit, foreach=True)
+
+        norms = [
+            nn.utils.clip_grad_norm_(group["params"], limit, foreach=True)
+            for group in self.optimizer.param_groups
+        ]
+        return torch.stack(norms).norm()
+
+    @torch.no_grad()
+    def _normalize_values(self, minibatch: TensorDictBase) -> None:
+        """Take a minibatch's targets into the statistics and normalise its values by them."""
+        self.value_norm.update(minibatch.get(keys.VALUE_TARGET)[minibatch.get(CRITIC_LEARNS)])
+        for key in (keys.VALUE_TARGET, keys.VALUE, BASELINE):
+            if key in minibatch.keys():
+                minibatch.set(key, self.value_norm.normalize(minibatch.get(key)))
 
     @torch.no_grad()
     def _update_norms(self, batch: TensorDictBase) -> None:
@@ -260,12 +304,14 @@ class PolicyLearner:
     def _load_trainable(self, state: dict[str, Any]) -> None:
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.load_state_dict(in_two_groups(state["optimizer"], len(list(self.actor.parameters()))))
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that resuming needs."""
         return self._trainable_state() | {
             "value_norm": self.value_norm.state_dict(),
+            "carried": self.carried.state_dict(),
+            "critic_states": self.reader.state_dict(),
             "updates": self.updates,
             "rollbacks": self.rollbacks,
         }
@@ -274,25 +320,43 @@ class PolicyLearner:
         """Resume from what `state_dict` returned."""
         self._load_trainable(state)
         self.value_norm.load_state_dict(state["value_norm"])
+        self.carried.load_state_dict(state.get("carried"))
+        self.reader.load_state_dict(state.get("critic_states", {}))
         self.rollbacks = int(state["rollbacks"])
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2
 
 
-def minibatch_rows(cfg: PPOConfig, rows: int, team_size: int) -> int:
-    """Return the team rows of a minibatch."""
-    if cfg.num_minibatches is not None:
-        # rounded up: rounded down it would give one minibatch too many
-        return -(-rows // cfg.num_minibatches)
-    return min(rows, max(1, cfg.minibatch_size // team_size))
+def value_layers(critic: TensorDictModule) -> list[nn.Linear]:
+    """Return the layers of a critic whose output is the value."""
+    net = critic.module
+    if isinstance(net, RecurrentCritic):
+        return net.value_heads
+    return [member.head for member in getattr(net, "nets", [net])]
 
 
-def has_value(entries: TensorDictBase) -> Tensor:
-    """Return which slots a value counts for: those that act, and departed ones while a team mate acts."""
-    acting = entries.get(keys.ACTING)
-    return acting | (entries.get(keys.DEPARTED) & acting.any(-2, keepdim=True))
+def _departed(following: TensorDictBase) -> Tensor:
+    """Return who departed, of the row after the last, where a team mate acts."""
+    last = following[-1]
+    return last.get(keys.DEPARTED) & last.get(keys.ACTING).any(-2, keepdim=True)
 
 
-def make_optimizer(params: list[nn.Parameter], cfg: PPOConfig) -> torch.optim.Optimizer:
-    """Build the optimizer; its fused form makes one pass over all parameters."""
+def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch.optim.Optimizer:
+    """Build the optimizer, with a group for the actor and one for the critic.
+
+    Its fused form makes one pass over all parameters.
+    """
     kind = torch.optim.AdamW if cfg.optimizer is Optimizer.adamw else torch.optim.Adam
-    return kind(params, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=1e-5, fused=True)
+    groups = [{"params": list(net.parameters())} for net in (actor, critic)]
+    return kind(groups, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=1e-5, fused=True)
+
+
+def in_two_groups(state: dict[str, Any], actor_size: int) -> dict[str, Any]:
+    """Return an optimizer's state with the actor's parameters in one group and the critic's in another.
+
+    Before 0.3 there was one group for all, the actor's first.
+    """
+    if len(state["param_groups"]) != 1:
+        return state
+    (group,) = state["param_groups"]
+    parts = group["params"][:actor_size], group["params"][actor_size:]
+    return state | {"param_groups": [group | {"params": list(part)} for part in parts]}

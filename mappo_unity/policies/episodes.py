@@ -1,7 +1,4 @@
-"""Play episodes of a BaseEnv with fixed policies and sum up what they earn.
-
-In: a BaseEnv and a policy for each behavior. Out: finished episodes, and figures as a dict.
-"""
+"""Play episodes of a BaseEnv with fixed policies, and sum up what they earn."""
 
 from __future__ import annotations
 
@@ -33,13 +30,13 @@ def play(
         The episodes of every behavior, in the order of their ends.
 
     Raises:
-        EnvironmentDataError: the environment sent what breaks its contract, or nobody asks any more.
+        EnvironmentDataError: the environment breaks its contract, or nobody requests decisions any more.
         EnvironmentFailure: so many episodes do not end.
     """
     running: dict[tuple[str, int], list[float]] = {}
     counts = _Counts(episodes)
     checks: dict[str, RecordCheck] = {}
-    silent = 0  # steps in a row in which nobody asked
+    silent = 0  # steps in a row in which nobody requested a decision
 
     env.reset()
     check_specs(env.behavior_specs)
@@ -52,8 +49,7 @@ def play(
             _forget_crashed(env, name, running, counts)
             _end_episodes(name, terminal, running, counts)
             actor = policy[name] if isinstance(policy, dict) else policy
-            # Who is not running here begins an episode: what it remembers is of another.
-            actor.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
+            _tell(actor, name, decision, terminal, running)
             _go_on(name, decision, running, counts)
             if len(decision):
                 silent = 0
@@ -98,12 +94,19 @@ def _forget_crashed(env: BaseEnv, name: str, running: dict, counts: _Counts) -> 
             counts.begun[name] -= 1
 
 
+def _tell(policy: Policy, name: str, decision: Any, terminal: Any, running: dict) -> None:
+    """Tell a policy whose episodes have ended, and who begins one: its memory is of another episode."""
+    policy.end(name, terminal.agent_id.tolist())
+    policy.forget(name, [a for a in decision.agent_id.tolist() if (name, a) not in running])
+
+
 def _end_episodes(name: str, terminal: Any, running: dict, counts: _Counts) -> None:
     for row, agent in enumerate(terminal.agent_id.tolist()):
         episode = running.pop((name, agent), None)
         if episode is None:
             continue
 
+        # The last reward comes with the end, and belongs to the episode.
         counted, individual, group, length = episode
         individual, group = (
             individual + float(terminal.reward[row]),

@@ -1,7 +1,4 @@
-"""What mappo-eval does: play a policy in its environment, alone or against an opponent.
-
-In: where the policies are. Out: figures as a dict. Prints nothing, learns nothing.
-"""
+"""What mappo-eval does: play a policy in its environment, alone or against an opponent."""
 
 from __future__ import annotations
 
@@ -65,6 +62,7 @@ def evaluate(
     finally:
         base_env.close()
 
+    # The figures of a single behavior stand at the top, those of several below their names.
     behaviors = {name: summarize(rows) for name, rows in finished.items()}
     return head | (next(iter(behaviors.values())) if len(behaviors) == 1 else {"behaviors": behaviors})
 

@@ -1,8 +1,8 @@
 """A checkpoint as files that Unity loads: one ONNX file for each policy name.
 
-In: a checkpoint, which holds some observations that its policies acted on. Out: files, written whole
-or not at all, and only after onnxruntime has played them as torch plays the checkpoint (`onnx_check`).
-`RunExports` keeps those of a running training up to date.
+A checkpoint holds some observations that its policies acted on. Files are written whole or not at all, and
+only after onnxruntime has played them as torch plays the checkpoint (`onnx_check`). `RunExports` keeps those
+of a training run up to date while it goes.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def sample_inputs(entries: TensorDictBase, in_keys: Sequence[str]) -> dict[str, 
 
 
 class RunExports:
-    """Keep ``best.onnx`` and ``final.onnx`` beside a running training's checkpoints.
+    """Keep ``best.onnx`` and ``final.onnx`` beside a training run's checkpoints while it goes.
 
     Whatever goes wrong becomes a line for the user, once, and never ends the run.
 

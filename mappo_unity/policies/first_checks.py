@@ -1,7 +1,7 @@
 """What mappo-eval, mappo-play and mappo-export can know about their options before torch is loaded.
 
-In: the options. Out: nothing, or a `ConfigError`, in a second instead of many. Plays and writes nothing. Only
-embedded scenes are opened, with a single area, to see whether the policies fit.
+A mistake is told in a second instead of many. Only embedded scenes are opened, with a single area, to see
+whether the policies fit; other environments would have to be started.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ def check_export(cfg: ExportConfig) -> None:
     for package in ("onnx", "onnxruntime"):
         import_package(package)
 
+    # A team of one has no network for each member, whatever share_parameters says.
     known = check_checkpoint(locate(cfg.run, "run"))
     for name, layout in known["layout"].items():
         if layout["team_size"] > 1 and not known["model"][name]["share_parameters"]:

@@ -1,7 +1,6 @@
 """What a policy was built for beside what an environment's behaviors are, and the sides that behaviors have.
 
-In: layouts of a checkpoint, behaviors and their specs. Out: nothing, or a `ConfigError` in the user's words.
-Imports no torch: what does not fit can be told before anything heavy is loaded.
+Torch is not imported: what does not fit can be told before anything heavy is loaded.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.protobuf import install
 
+# Before mlagents_envs: its messages do not load on a current protobuf without this.
 install()
 
 from mlagents_envs.base_env import BehaviorSpec  # noqa: E402

@@ -1,7 +1,6 @@
 """Matches between two policies in a two-sided scene, both sides in turn.
 
-In: a function that opens the environment, two policies. Out: wins, draws and losses with a
-confidence interval. A side is a team id (``Name?team=1``): its behaviors belong to one policy.
+A side is a team id (``Name?team=1``): its behaviors belong to one policy.
 
 A match is one episode of a team. The side whose group reward (individual reward where there are no
 groups) is positive at its end has won, one with a negative one has lost; anything else is a draw.
@@ -106,6 +105,7 @@ def play_side(env: BaseEnv, policies: dict[str, Policy], own: list[str], matches
     name = own[0]
     env.reset()
     groups = env.get_steps(name)[0].group_id
+    # Group 0 is none: without teams the match of an agent is its own episode.
     members = max(1, int((groups == groups[0]).sum())) if groups[0] > 0 else 1
     # Each member of a team has an agent episode of its own in every match.
     episodes = play(env, policies, matches * members, only=name)[name]
@@ -134,8 +134,8 @@ def count(episodes: list[Episode], grouped: bool) -> Score:
     return score
 
 
-def wilson(wins: int, total: int) -> tuple[float, float]:
-    """Return Wilson's 95 % confidence interval of a share (Wilson 1927)."""
+def wilson(wins: float, total: int) -> tuple[float, float]:
+    """Return Wilson's 95 % confidence interval of a share (Wilson 1927); a draw may count as half a win."""
     if not total:
         return math.nan, math.nan
     share, z2 = wins / total, Z95**2

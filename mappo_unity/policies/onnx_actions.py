@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from torch import Tensor, nn
 
-from mappo_unity.learning.actor_critic import LOG_STD_RANGE, Actor
+from mappo_unity.config.schema import LOG_STD_RANGE
+from mappo_unity.learning.actor_critic import Actor
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout, scale_shift
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def _squashed_head(graph: Graph, hidden: str, head: nn.Linear, init_log_std: flo
 
 def _outputs(graph: Graph, mean: str, std: str, size: int, limited: Callable[[str, str], object]) -> None:
     """Add a draw and the middle of a Gaussian as outputs, each brought into [-1, 1] by ``limited``."""
-    noise = graph.node("RandomNormalLike", [mean], dtype=1)
+    noise = graph.node("RandomNormalLike", [mean], dtype=1)  # float32
     sample = graph.node("Add", [mean, graph.node("Mul", [noise, std])])
 
     limited(sample, "continuous_actions")
@@ -79,6 +80,7 @@ def _outputs(graph: Graph, mean: str, std: str, size: int, limited: Callable[[st
 def _discrete_heads(graph: Graph, hidden: str, head: nn.Linear, layout: ActionLayout) -> None:
     """Add a draw and the mode of every branch."""
     masks = graph.input("action_masks", [sum(layout.branches)])
+    # `_categorical` takes these by name, for every branch.
     graph.constant("one", 1.0)
     graph.constant("forbidden", FORBIDDEN)
     start = head.out_features - layout.num_logits
@@ -139,5 +141,5 @@ def _categorical(graph: Graph, logits: str, mask: str) -> tuple[str, str]:
     penalty = graph.node("Mul", [graph.node("Sub", ["one", mask]), "forbidden"])
     masked = graph.node("Sub", [graph.node("Mul", [logits, mask]), penalty])
     probs = graph.node("Softmax", [masked], axis=1)
-    draw = graph.node("Multinomial", [graph.node("Log", [probs])], dtype=7, sample_size=1)
+    draw = graph.node("Multinomial", [graph.node("Log", [probs])], dtype=7, sample_size=1)  # int64
     return draw, graph.node("ArgMax", [probs], axis=1, keepdims=1)

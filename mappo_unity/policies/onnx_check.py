@@ -1,7 +1,6 @@
-"""An ONNX model against the actor that it was made from, on the same observations.
+"""An ONNX model compared with the actor that it was made from, on the same observations.
 
-In: a model's bytes, the actor, some of its inputs. Out: the largest difference, or an ExportError.
-Deterministic actions must agree to 1e-5, sampled ones in distribution. Knows nothing of files.
+Deterministic actions must agree to 1e-5, sampled ones in distribution.
 """
 
 from __future__ import annotations
@@ -54,6 +53,7 @@ def compare(
             f"{error:.3g}, more than {TOLERANCE:g}"
         )
 
+    # The graph draws one action a row: as many runs as make DRAWS actions over all rows.
     runs = math.ceil(DRAWS / len(params))
     drawn = [_run(session, feed, "", expected) for _ in range(runs)]
     _compare_continuous(expected, drawn)

@@ -1,9 +1,7 @@
 """An actor as the ONNX graph that Unity's Agent plays: ML-Agents model format 3.
 
-In: an `Actor`, the shapes of its sensors. Out: an onnx ModelProto. Built node by node, not traced:
-the graph has the operators, names and shapes of the files that ML-Agents itself writes (opset 9,
-which Sentis and the Inference Engine import), whatever torch's own exporter does. Knows nothing of
-checkpoints and files.
+It is built node by node, not traced: it has the operators, names and shapes of the files that ML-Agents
+itself writes (opset 9, which Sentis and the Inference Engine import), whatever torch's own exporter does.
 
     inputs   obs_0 ... obs_n  float32 [batch, size] or [batch, C, H, W], in the order of the sensors
              action_masks     float32 [batch, sum of branches], 1 = allowed; only with branches
@@ -56,6 +54,7 @@ def build_model(
     graph.tell("version_number", [FORMAT], [1])
     graph.tell("memory_size", [0.0], [1])
 
+    # The last layer gives all actions at once; the graph has one of its own for each kind.
     *body, head = network.net
     if not isinstance(head, nn.Linear):
         raise ExportError(f"the policy network ends in {with_article(type(head).__name__)}, not in a Linear")
@@ -153,7 +152,7 @@ def _conv(graph: Graph, layer: Any, x: str, name: str) -> str:
         raise ExportError(f"layer {name}: only plain convolutions (one group, zero padding) can be exported")
     inputs = [x, graph.constant(f"{name}.weight", layer.weight), graph.constant(f"{name}.bias", layer.bias)]
     sizes = {"kernel_shape": layer.kernel_size, "strides": layer.stride, "dilations": layer.dilation}
-    return graph.node("Conv", inputs, pads=[*layer.padding, *layer.padding], group=1, **sizes)
+    return graph.node("Conv", inputs, pads=[*layer.padding, *layer.padding], group=1, **sizes)  # begins, ends
 
 
 def _layer_norm(graph: Graph, layer: Any, x: str, name: str) -> str:

@@ -1,7 +1,5 @@
 """ONNX files as policies: our own exports and those of ML-Agents (model formats 2 and 3).
 
-In: a file, the records of a BaseEnv. Out: ActionTuples. Knows nothing of checkpoints or torch.
-
 Format 3 has an input for each sensor (``obs_i``) and gives branch indices; format 2 has all vectors
 in one (``vector_observation``) and gives log-probabilities, from which branches are drawn here.
 Recurrent files get each agent's memory back until its episode ends.
@@ -69,6 +67,7 @@ class OnnxPolicy:
             action.add_continuous(out[self._output("continuous_actions")].astype(np.float32))
 
         if branches:
+            # Format 2 gives log-probabilities, format 3 indices: the type tells them apart.
             chosen = out[self._output("discrete_actions")]
             chosen = self._draw(chosen, branches) if np.issubdtype(chosen.dtype, np.floating) else chosen
             action.add_discrete(chosen.astype(np.int32))
@@ -80,8 +79,12 @@ class OnnxPolicy:
         for agent in agent_ids:
             self._memory.pop((behavior, int(agent)), None)
 
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Do nothing: what was remembered is dropped when an agent begins again."""
+
     def check(self, behavior: str, spec: BehaviorSpec) -> None:
         """Raise ConfigError if this file cannot play that behavior."""
+        # Called with every step: what fitted once is not compared again.
         if behavior in self._fits:
             return
         name = self.metadata.get("behavior_name")
@@ -214,6 +217,9 @@ class OnnxFolder:
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
         """Drop the memory of agents that begin an episode."""
         self._policy(behavior).forget(behavior, agent_ids)
+
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Do nothing: see `OnnxPolicy.end`."""
 
     def _policy(self, behavior: str) -> OnnxPolicy:
         name = keys.policy_name(behavior)

@@ -1,29 +1,25 @@
-"""Things that act on DecisionSteps: a trained checkpoint, or chance.
-
-In: the records of a BaseEnv. Out: ActionTuples. Used to play, not to learn.
-"""
+"""Policies that act on DecisionSteps: a trained checkpoint, or chance."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from mlagents_envs.base_env import ActionSpec, ActionTuple, BehaviorSpec, DecisionSteps
 from omegaconf import OmegaConf
 from tensordict import TensorDict
-from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity import keys
-from mappo_unity.config.schema import ModelConfig
-from mappo_unity.errors import ConfigError
-from mappo_unity.learning.actor_critic import make_actor
+from mappo_unity.config.schema import ModelConfig, bounded_log_std
+from mappo_unity.learning.actor_critic import PerMember, make_actor
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
 from mappo_unity.policies.layouts import check_layout
+from mappo_unity.policies.members import MemberTable, Places, team_places
 from mappo_unity.runs import checkpoint
 
 
@@ -36,6 +32,10 @@ class Policy(Protocol):
 
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
         """Drop the memory of agents that begin an episode."""
+        ...
+
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Take note that episodes of these agents have ended, before the next `act`."""
         ...
 
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
@@ -53,6 +53,9 @@ class RandomPolicy:
         """Accept every behavior."""
 
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Remember nothing."""
+
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
         """Remember nothing."""
 
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
@@ -85,6 +88,14 @@ class ActorPolicy:
         self, layout: dict[str, Any], actors: dict[str, Any], deterministic: bool, name: str
     ) -> None:
         self.layout, self.actors, self.deterministic, self.name = layout, actors, deterministic, name
+        # where every member has a network of its own, an agent must stay the member that it is
+        self._per_member = {
+            name
+            for name, actor in actors.items()
+            if any(isinstance(part, PerMember) for part in actor.modules())
+        }
+        self._members: dict[str, MemberTable] = {}
+        self._memories: dict[str, dict[int, np.ndarray]] = {}  # states [M] of each behavior's agents
 
     @torch.no_grad()
     def act(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> ActionTuple:
@@ -92,16 +103,20 @@ class ActorPolicy:
         name = keys.policy_name(behavior)
         self.check(behavior, spec)
 
-        places = team_places(steps.group_id, self.layout[name]["team_size"])
+        places = self._places(behavior, steps)
         device = next(self.actors[name].parameters()).device
-        entries = {k: _spread(v, places).to(device) for k, v in _inputs(steps, spec).items()}
+        inputs = _inputs(steps, spec)
+        if self.actors[name].has_memory:
+            inputs[keys.MEMORY] = self._remembered(behavior, steps.agent_id, self.actors[name].memory_size)
+        entries = {k: _spread(v, places).to(device) for k, v in inputs.items()}
 
-        kind = ExplorationType.DETERMINISTIC if self.deterministic else ExplorationType.RANDOM
-        with set_exploration_type(kind):
-            out = self.actors[name](TensorDict(entries, places.shape)).get(keys.ACTION)
+        drawn = self.actors[name].draw(TensorDict(entries, places.shape), self.deterministic)
+        if drawn.memory is not None:
+            after = drawn.memory.cpu().numpy()[places.teams, places.members]
+            self._memories[behavior].update(zip(steps.agent_id.tolist(), after))
 
         # Back to the rows of `steps`: the network gives whole teams, with their empty places.
-        chosen = out.cpu().numpy()[places.teams, places.members]
+        chosen = drawn.action.cpu().numpy()[places.teams, places.members]
         size, action = spec.action_spec.continuous_size, ActionTuple()
         if size:
             scaled = np.clip(chosen[:, :size], -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT
@@ -116,7 +131,28 @@ class ActorPolicy:
         check_layout(self.name, self.layout, behavior, spec)
 
     def forget(self, behavior: str, agent_ids: Iterable[int]) -> None:
-        """Remember nothing."""
+        """Drop the memory of agents that begin an episode."""
+        for agent in agent_ids:
+            self._memories.get(behavior, {}).pop(int(agent), None)
+
+    def _remembered(self, behavior: str, agent_ids: np.ndarray, size: int) -> np.ndarray:
+        """Return the states ``[n, M]`` of agents, zero for those that act for the first time."""
+        known = self._memories.setdefault(behavior, {})
+        nothing = np.zeros(size, np.float32)
+        return np.stack([known.get(agent, nothing) for agent in agent_ids.tolist()])
+
+    def end(self, behavior: str, agent_ids: Iterable[int]) -> None:
+        """Take note that the places of these agents may be given to new members of their teams."""
+        if behavior in self._members:
+            self._members[behavior].end(agent_ids)
+
+    def _places(self, behavior: str, steps: DecisionSteps) -> Places:
+        name = keys.policy_name(behavior)
+        team_size = self.layout[name]["team_size"]
+        if name not in self._per_member:
+            return team_places(steps.group_id, team_size)
+        table = self._members.setdefault(behavior, MemberTable(team_size))
+        return table.places(steps.agent_id, steps.group_id)
 
 
 class CheckpointPolicy(ActorPolicy):
@@ -132,39 +168,6 @@ class CheckpointPolicy(ActorPolicy):
         super().__init__(state["layout"], actors, deterministic, f"checkpoint {path}")
         self.path = path
         self.agent_steps = int(state["agent_steps"])
-
-
-class Places(NamedTuple):
-    """Where each row of a result stands among the teams."""
-
-    teams: np.ndarray  # int [n]
-    members: np.ndarray  # int [n]
-    shape: tuple[int, int]  # G, A
-
-
-def team_places(group_id: np.ndarray, team_size: int) -> Places:
-    """Give each row its team and its place in it: the order of the rows of a group.
-
-    Members that are not asked at the same time are not told apart by this; it matters only to
-    policies with a network for each member.
-    """
-    # Group 0 is none: each of its agents is a team of its own, numbered after the groups.
-    alone = np.arange(len(group_id)) + int(group_id.max(initial=0)) + 1
-    keys_ = np.where(group_id > 0, group_id, alone)
-    _, teams = np.unique(keys_, return_inverse=True)
-
-    # Stable, so that the members of a team keep the order of their rows.
-    order = np.argsort(teams, kind="stable")
-    starts = np.flatnonzero(np.r_[True, np.diff(teams[order]) > 0])
-    members = np.empty(len(teams), np.int64)
-    members[order] = np.arange(len(teams)) - np.repeat(starts, np.diff(np.r_[starts, len(teams)]))
-
-    if members.max(initial=0) >= team_size:
-        raise ConfigError(
-            f"a team of {members.max() + 1} agents is larger than the policy's {team_size} members"
-        )
-
-    return Places(teams, members, (int(teams.max(initial=-1)) + 1, team_size))
 
 
 def _inputs(steps: DecisionSteps, spec: BehaviorSpec) -> dict[str, np.ndarray]:
@@ -207,6 +210,8 @@ def _actor(state: dict[str, Any], name: str) -> Any:
 def model_from_saved(saved: dict[str, Any]) -> ModelConfig:
     """Return the model options that a checkpoint holds; those that it does not know have their defaults."""
     known = {field.name: saved[field.name] for field in fields(ModelConfig) if field.name in saved}
+    if "init_log_std" in known:
+        known["init_log_std"] = bounded_log_std(known["init_log_std"])
     model = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ModelConfig), known))
     assert isinstance(model, ModelConfig)
     return model

@@ -1,7 +1,6 @@
 """What a path given as run=, policy=, opponent= or resume= is, as far as that can be known without torch.
 
-In: the path and the option that named it. Out: its kind and the file or folder that is meant, or a
-`ConfigError` that says what the path is instead and what the option takes.
+A path that does not fit is a `ConfigError`, which says what it is instead and what the option takes.
 """
 
 from __future__ import annotations

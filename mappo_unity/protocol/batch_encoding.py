@@ -14,6 +14,7 @@ from mappo_unity.protocol.messages import delimited, varint
 
 VARINT_BYTES = 5  # holds any int32 >= 0
 _SHIFTS = np.arange(0, 7 * VARINT_BYTES, 7, dtype=np.int64)
+# the high bit of a byte says that another one follows
 _GO_ON = np.array([0x80] * (VARINT_BYTES - 1) + [0], np.uint8)
 
 

@@ -31,6 +31,7 @@ class BehaviorDecoder:
         self.name, self.spec = name, spec
         branches = spec.action_spec.discrete_branches
         self._cuts = list(np.cumsum(branches)[:-1])
+        # zeros forbid nothing
         self._allowed = bytes(sum(branches))
         # bytes of each sensor's float32 numbers
         self._widths = [4 * int(np.prod(sensor.shape)) for sensor in spec.observation_specs]
@@ -77,6 +78,7 @@ class BehaviorDecoder:
 
     def _sensor(self, index: int, observations: list[Any], agents: np.ndarray) -> np.ndarray:
         shape = self.spec.observation_specs[index].shape
+        # a sensor is sent in the same way for all its agents
         if observations[0].compression_type == PNG:
             return np.stack([self._picture(index, o) for o in observations])
 

@@ -158,6 +158,7 @@ def decode_actions(spec: BehaviorSpec, values: Sequence[Any]) -> ActionTuple:
 
     if branches:
         if old:
+            # such a client sends branch indices as floats
             discrete = _floats([v.vector_actions_deprecated for v in values], branches).astype(np.int32)
         else:
             discrete = np.array([v.discrete_actions for v in values], np.int32)

@@ -56,6 +56,7 @@ def message_class() -> Any:
     install()
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
+    # a pool of our own: in the default one are the messages as mlagents_envs declares them
     pool = descriptor_pool.DescriptorPool()
 
     def add(file: Any) -> None:

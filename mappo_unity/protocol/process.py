@@ -54,6 +54,7 @@ def find_executable(file_name: str, option: str = "env.file_name") -> Path:
         raise ConfigError(f"{option}= is empty: give the path of the built player")
 
     path = Path(os.path.expanduser(file_name))
+    # before ML-Agents looks: to it a broken link is just a missing file
     _check_link(path, f"{option}={file_name}")
 
     # ML-Agents takes the name for a pattern; where that finds nothing, its brackets are letters

@@ -182,6 +182,7 @@ class RestartingPlayer(BaseEnv):
 
             time.sleep(pause_s)
             try:
+                # the failed player needs no `close`: `UnityPlayer` ends itself before it raises
                 self.player = self._make_player((self._seed + SEED_STRIDE * self.restarts) % 2**31)
                 self.player.connect()
                 self.player.reset()

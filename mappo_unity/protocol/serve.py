@@ -58,6 +58,7 @@ def env_function(scene: str, num_areas: int | None = None, params: dict[str, flo
 
         factory = load_factory(scene, scene)
         check_call(factory, scene, fixed)
+        # the trainer's number of areas is left out: a factory need not take it
         return lambda seed, areas: call_factory(factory, scene, seed, fixed)
     from mappo_unity.scenes import make_scene, scene_names
 

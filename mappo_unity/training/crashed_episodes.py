@@ -15,14 +15,21 @@ from mappo_unity import keys
 from mappo_unity.envs.unity_env import CrashedEpisodes, UnityEnv
 
 
-def mask_crashed_episodes(batch: TensorDictBase, crashes: Sequence[CrashedEpisodes], env: UnityEnv) -> int:
-    """Set `acting` and `departed` to False in every row of the crashed episodes; return how many rows acted.
+def mask_crashed_episodes(
+    batch: TensorDictBase, crashes: Sequence[CrashedEpisodes], env: UnityEnv
+) -> tuple[int, dict[str, Tensor]]:
+    """Set `acting` and `departed` to False in every row of the crashed episodes.
 
     Args:
         batch: ``[T]``, one entry a policy name, whose last row is the environment's last round.
         crashes: which episodes crashed in rounds of this batch.
+
+    Returns:
+        How many rows acted; for each policy name that crashed, bool ``[..., A, 1]``, slots whose crashed
+        episode had begun before the batch.
     """
     dropped = 0
+    void: dict[str, Tensor] = {}
     for crash in crashes:
         name = keys.policy_name(crash.behavior)
         side = env.sides[name].index(crash.behavior) if len(env.sides[name]) > 1 else None
@@ -39,7 +46,11 @@ def mask_crashed_episodes(batch: TensorDictBase, crashes: Sequence[CrashedEpisod
             own &= ~rows
             batch.set((name, key), flags)
 
-    return dropped
+        void.setdefault(name, torch.zeros_like(batch.get((name, keys.ACTING))[0]))
+        whose = void[name] if side is None else void[name][side]
+        whose |= rows[0]
+
+    return dropped, void
 
 
 def episode_rows(done_T: Tensor, last: int, slots: Tensor) -> Tensor:
@@ -50,7 +61,7 @@ def episode_rows(done_T: Tensor, last: int, slots: Tensor) -> Tensor:
         slots: bool ``[...]``, whose episodes are meant.
     """
     rows = torch.zeros_like(done_T)
-    playing = slots.clone()
+    playing = slots.to(done_T.device, copy=True)  # slots come from numpy, the batch may lie on a GPU
 
     # Backwards from the end, until a row in which the episode before it ended.
     for t in range(last, -1, -1):

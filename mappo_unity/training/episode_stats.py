@@ -6,9 +6,7 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from tensordict import TensorDictBase
 
-from mappo_unity import keys
 from mappo_unity.envs.rounds import Episode
 
 
@@ -84,11 +82,6 @@ def _summary(prefix: str, rows: list[tuple[float, float, int]]) -> dict[str, flo
         f"{prefix}group_return_mean": float(group.mean()),
         f"{prefix}episode_length_mean": float(length.mean()),
     }
-
-
-def count_decisions(batch: TensorDictBase, policies: list[str]) -> int:
-    """Return how many agent decisions a batch holds (ML-Agents' steps)."""
-    return int(sum(batch.get((name, keys.ACTING)).sum() for name in policies))
 
 
 def by_policy(metrics: dict[str, dict[str, float]]) -> dict[str, float]:

@@ -44,6 +44,7 @@ def why_over(cfg: Config, path: Path) -> str | None:
             "max_steps=N with a larger N trains on"
         )
 
+    # the window is as long as the options of the resumed run say
     episodes = RecentEpisodes(cfg.log.return_window, list(state["window"]["recent"]))
     episodes.load_state_dict(state["window"])
     if cfg.stop_at_return is not None and episodes.reached(cfg.stop_at_return):

@@ -195,6 +195,7 @@ def _options(tree: DictConfig) -> DictConfig:
 def _changed(tree: DictConfig, overrides: list[Override], job: list[str]) -> Config:
     tree = tree.copy()
     for override in overrides:
+        # presets are in the tree already
         if override.key_or_group not in group_choices():
             OmegaConf.update(tree, override.key_or_group, override.value(), merge=True, force_add=True)
     return _named(lambda: to_config(tree), job)

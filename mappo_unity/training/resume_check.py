@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.config.schema import ModelConfig
+from mappo_unity.config.schema import ModelConfig, bounded_log_std
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.policies.layouts import describe_spec
 from mappo_unity.runs.checkpoint import CheckpointError
@@ -40,6 +40,7 @@ def check_compatible(
     for name, model in models.items():
         # an option that the checkpoint does not know yet had its default's effect
         saved = defaults | state["model"][name]
+        saved["init_log_std"] = bounded_log_std(saved["init_log_std"])
         different += [f"model.{k}={saved[k]} there, {v} here" for k, v in model.items() if saved[k] != v]
 
     if different:

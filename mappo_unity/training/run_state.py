@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 
 from mappo_unity.config.per_behavior import behavior_config
 from mappo_unity.config.schema import Config
@@ -16,8 +15,8 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import sample_inputs
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
-from mappo_unity.training.crashed_episodes import mask_crashed_episodes
-from mappo_unity.training.episode_stats import RecentEpisodes, count_decisions
+from mappo_unity.training.batches import Batch
+from mappo_unity.training.episode_stats import RecentEpisodes
 from mappo_unity.training.match_series import MatchSeries
 from mappo_unity.training.resume_check import check_compatible, describe_models, describe_policies
 from mappo_unity.training.setup import TrainingSetup
@@ -51,12 +50,13 @@ class RunState:
         self.recent_episodes = RecentEpisodes(cfg.log.return_window, list(setup.env.behaviors))
         self.matches = MatchSeries(cfg, folder, setup.env.behaviors)
         self.samples: dict[str, dict[str, torch.Tensor]] = {}
+        self._restarts_here = 0
         self._rng_state: dict[str, Any] | None = None  # of the checkpoint that is resumed
 
     @property
     def restarts(self) -> int:
         """How often players were started again in this run."""
-        return self.restarts_before + (self.setup.env.restarts or 0)
+        return self.restarts_before + self._restarts_here
 
     @property
     def updates(self) -> dict[str, tuple[int, int]]:
@@ -64,15 +64,14 @@ class RunState:
         learners = self.setup.learners
         return {name: (learner.rollbacks, learner.updates) for name, learner in learners.items()}
 
-    def mask_crashed(self, batch: TensorDictBase) -> dict[str, float]:
-        """Take the episodes that crashed players cut off out of the batch; return what they cost so far."""
-        env = self.setup.env
-        if env.restarts is None:
+    def count_crashed(self, batch: Batch) -> dict[str, float]:
+        """Count what crashed players have cost; return it, where there are players."""
+        if batch.restarts is None:
             return {}
 
-        crashed = env.pop_crashed_episodes()
-        self.dropped_steps += mask_crashed_episodes(batch, crashed, env)
-        self.dropped_episodes += sum(int(crash.slots.sum()) for crash in crashed)
+        self._restarts_here = batch.restarts
+        self.dropped_steps += batch.dropped_steps
+        self.dropped_episodes += batch.dropped_episodes
 
         return {
             "restarts": float(self.restarts),
@@ -80,7 +79,7 @@ class RunState:
             "dropped_steps": float(self.dropped_steps),
         }
 
-    def count(self, batch: TensorDictBase, collect_s: float, update_s: float) -> dict[str, float]:
+    def count(self, batch: Batch, collect_s: float, update_s: float) -> dict[str, float]:
         """Count an iteration; return its metrics but those of learning.
 
         Args:
@@ -88,15 +87,16 @@ class RunState:
             collect_s, update_s: seconds that collecting and learning took.
         """
         learners, seconds = self.setup.learners, collect_s + update_s
-        steps = count_decisions(batch, list(learners))
+        steps = sum(batch.count_decisions(name) for name in learners)
         self.samples = {
-            name: sample_inputs(batch.get(name), learner.actor.in_keys) for name, learner in learners.items()
+            name: sample_inputs(batch.rounds.get(name), learner.actor.in_keys)
+            for name, learner in learners.items()
         }
 
         self.iteration += 1
         self.agent_steps += steps
         self.wall_s += seconds
-        episodes_new = self.recent_episodes.add(self.setup.env.pop_episodes())
+        episodes_new = self.recent_episodes.add(batch.episodes)
 
         counters = {"iteration": self.iteration, "agent_steps": self.agent_steps, "wall_s": self.wall_s}
         episodes = {"episodes": self.recent_episodes.total, "episodes_new": episodes_new}
@@ -130,6 +130,7 @@ class RunState:
             "layout": self._layout(),
             "learners": copy.deepcopy(learners),
             "env": self.setup.env.get_state(),
+            "memories": {name: memory.clone() for name, memory in self.setup.policy.memories.items()},
             "window": self.recent_episodes.state_dict(),
             "matches": self.matches.state_dict(),
             "rng": get_rng_state(),
@@ -152,12 +153,15 @@ class RunState:
             learner.load_state_dict(state["learners"][name])
         # an environment that gives no snapshots begins new episodes
         if state["env"] is not None:
+            # without its environment's state a run begins new episodes, and memories anew with them
+            self.setup.policy.memories = dict(state.get("memories", {}))
             self._restore_env(path, checkpoint.to_arrays(state["env"]))
 
         self.recent_episodes.load_state_dict(state["window"])
         self.matches.load_state_dict(state["matches"])
         for name in _COUNTERS:
             setattr(self, name, state[name])
+        self.best_score = self.matches.comparable(self.best_score, state["matches"])
 
         # checkpoints of older versions hold no samples
         self.samples = state.get("samples", {})

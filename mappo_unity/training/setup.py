@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType
 
@@ -30,6 +29,7 @@ from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
+from mappo_unity.training.batches import Batch, BatchCollector, count_present
 from mappo_unity.training.memory import check_free, show_size
 
 BATCH_COPIES = 6
@@ -58,21 +58,20 @@ class TrainingSetup:
         self.cfg, self.env = cfg, env
         self.notes = [f"note: {cfg.env.note}"] if cfg.env.note is not None else []
 
-        self.rounds = batch_rounds(cfg.collect, env)
-        self.learners = make_learners(cfg, env, self.rounds, self.notes.append)
+        self.learners = make_learners(cfg, env, batch_rounds(cfg.collect, env), self.notes.append)
         self.policy = JointPolicy({name: learner.actor for name, learner in self.learners.items()})
 
     @contextmanager
-    def collecting(self) -> Iterator[Iterator[TensorDictBase]]:
-        """Yield endless batches ``[T, ...]``, collected from where the environment stands."""
-        collector = make_collector(transformed(self.env), self.policy, self.rounds, self.cfg.device)
+    def collecting(self) -> Iterator[BatchCollector]:
+        """Yield endless batches, collected from where the environment stands."""
+        collector = make_collector(transformed(self.env), self.policy, device=self.cfg.device)
         try:
-            yield iter(collector)
+            yield BatchCollector(collector, self.env, self.cfg.collect)
         finally:
             # `set_up` opened the environment, and closes it
             collector.shutdown(close_env=False)
 
-    def learn(self, batch: TensorDictBase, progress: float) -> dict[str, dict[str, float]]:
+    def learn(self, batch: Batch, progress: float) -> dict[str, dict[str, float]]:
         """Improve every policy by a batch; return the metrics of each.
 
         Args:
@@ -81,9 +80,11 @@ class TrainingSetup:
         """
         # Large minibatches gain from threads; small networks, while collecting, do not.
         torch.set_num_threads(min(self.cfg.update_threads, os.cpu_count() or 1))
-        metrics = {
-            name: learner.learn(entries_of(batch, name), progress) for name, learner in self.learners.items()
-        }
+        metrics = {}
+        for name, learner in self.learners.items():
+            if name in batch.void:
+                learner.carried.void(batch.void[name])
+            metrics[name] = learner.learn(batch.of(name), progress)
         torch.set_num_threads(self.cfg.num_threads)
         return metrics
 
@@ -131,16 +132,15 @@ def make_unity_env(cfg: Config, folder: Path) -> UnityEnv:
 
 
 def batch_rounds(cfg: CollectConfig, env: UnityEnv) -> int:
-    """Return the rounds of a batch, for the agents that the environment began with."""
+    """Return the rounds of a batch in which all agents act that the environment began with."""
     if cfg.rounds is not None:
         return cfg.rounds
     # agents that are there, not slots: some of these may stay empty
-    agents = sum(int(behavior.present.sum()) for behavior in env.behaviors.values())
-    return -(-cfg.batch_size // max(1, agents))
+    return -(-cfg.batch_size // max(1, count_present(env)))
 
 
-def make_collector(env: EnvBase, policy: JointPolicy, rounds: int, device: str = "cpu") -> Collector:
-    """Build a collector of endless batches of so many rounds, on the networks' device."""
+def make_collector(env: EnvBase, policy: JointPolicy, rounds: int = 1, device: str = "cpu") -> Collector:
+    """Build a collector of endless stretches of so many rounds, on the networks' device."""
     devices = {"policy_device": device, "env_device": "cpu", "storing_device": device}
     return Collector(
         env,
@@ -155,13 +155,6 @@ def make_collector(env: EnvBase, policy: JointPolicy, rounds: int, device: str =
         auto_register_policy_transforms=False,
         **({} if device == "cpu" else devices),
     )
-
-
-def entries_of(batch: TensorDictBase, name: str) -> TensorDictBase:
-    """Return one policy name's entries of a batch, with its own ``next``."""
-    entries = batch.get(name).copy()
-    entries.set("next", batch.get(("next", name)))
-    return entries
 
 
 def make_learners(
@@ -185,6 +178,7 @@ def make_learners(
     for name, sides in env.sides.items():
         model, ppo = behavior_config(cfg, name)
         behavior = env.behaviors[sides[0]]
+        # sides that share a policy are stacked: all their teams are rows of its batch
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
         check_minibatches(name, ppo, rounds, teams, team_size, note)
 
@@ -194,8 +188,8 @@ def make_learners(
 
         # Built after the check, so that what does not fit is refused by a line of ours.
         actor = make_actor(obs, layout, team_size, model).to(cfg.device)
-        critic = make_critic(obs, team_size, model).to(cfg.device)
-        learners[name] = PolicyLearner(actor, critic, ppo, rounds * teams, team_size)
+        critic = make_critic(obs, team_size, model, layout).to(cfg.device)
+        learners[name] = PolicyLearner(actor, critic, ppo)
 
     return learners
 
@@ -236,7 +230,7 @@ def check_network_memory(
 ) -> None:
     """Raise ConfigError if a policy's networks do not fit into the memory that is free."""
     with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers
-        nets = make_actor(obs, layout, team_size, cfg), make_critic(obs, team_size, cfg)
+        nets = make_actor(obs, layout, team_size, cfg), make_critic(obs, team_size, cfg, layout)
 
     size = sum(p.numel() * p.element_size() for net in nets for p in net.parameters())
     check_free(

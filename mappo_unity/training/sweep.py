@@ -104,6 +104,7 @@ def run_sweep(lines: list[str], file: Path | None = None) -> SweepResult:
             traceback.print_exc()
             result.error = f"{type(error).__name__}: {error}"
 
+    # where jobs run side by side, the first signal raised nothing
     result.signal = result.signal or patience.number
     result.jobs = _rank(_read_results(folder.path) + _missing(folder.path, plan.jobs))
     return result
@@ -179,6 +180,7 @@ def _train(config: Config, folder: Path, result: JobResult) -> int | None:
         outcome = train(config, folder)
 
     result.status = outcome.status
+    # JSON has no nan
     mean = outcome.return_mean
     result.return_mean = mean if mean is not None and math.isfinite(mean) else None
     result.agent_steps = outcome.agent_steps

@@ -12,13 +12,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
-from tensordict import TensorDictBase
 
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
 from mappo_unity.runs.logger import RunLog
 from mappo_unity.signals import Interrupted
+from mappo_unity.training.batches import Batch
 from mappo_unity.training.episode_stats import by_policy
 from mappo_unity.training.memory import is_out_of_memory
 from mappo_unity.training.outcome import DIVERGED, FINISHED, INTERRUPTED, SOLVED, Outcome, why_over
@@ -79,16 +79,15 @@ def train(
                 except BaseException as error:
                     with stop.ignored():
                         saver.rescue(log.message_if_possible)
-                    # with a checkpoint an interrupted run can be resumed: it has an outcome like any other
                     if not isinstance(error, Interrupted) or saver.last is None:
-                        raise
+                        raise  # an interrupted run has an outcome only where it can be resumed
                     status = INTERRUPTED
             return _outcome(status, state, saver, stop)
 
 
 def _iterate(
     cfg: Config,
-    batches: Iterator[TensorDictBase],
+    batches: Iterator[Batch],
     state: RunState,
     saver: CheckpointSaver,
     log: RunLog,
@@ -102,8 +101,7 @@ def _iterate(
         batch = next(batches)
         collected_s = time.perf_counter()
 
-        # Episodes of crashed players teach nothing and do not count.
-        crashed = state.mask_crashed(batch)
+        crashed = state.count_crashed(batch)
         learned = state.setup.learn(batch, progress=state.agent_steps / cfg.max_steps)
         learned_s = time.perf_counter()
 

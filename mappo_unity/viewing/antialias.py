@@ -1,6 +1,6 @@
 """Smooth edges in finished pictures, on the processor.
 
-In: a picture. Out: the same picture without stair steps. Where there is no graphics card, OpenGL's own
+Where there is no graphics card, OpenGL's own
 way (four samples a pixel) costs more than the rest of the picture; this looks at the pixels at edges only.
 
 The method is FXAA (T. Lottes, "FXAA", NVIDIA 2009): a stair step of an edge is found by walking along the

@@ -1,7 +1,4 @@
-"""The camera of a video, from frame to frame: it stands, or goes smoothly after an agent.
-
-In: a scene and its drawing. Out: a view for each frame. Draws nothing.
-"""
+"""The camera of a video, from frame to frame: it stands still, or follows an agent smoothly."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The caption of a video: one line with the scene, the time and what was earned so far.
-
-In: the records of a scene; then frames. Out: parts of a line; frames with that line. Knows no renderer.
-"""
+"""The caption of a video: one line with the scene, the time and what was earned so far."""
 
 from __future__ import annotations
 

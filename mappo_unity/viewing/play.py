@@ -1,7 +1,4 @@
-"""What mappo-play does: show a policy in its embedded scene, in a video file or in a window.
-
-In: `PlayConfig`. Out: a video, and what was played as a dict. Prints nothing, learns nothing.
-"""
+"""What mappo-play does: show a policy in its embedded scene, in a video file or in a window."""
 
 from __future__ import annotations
 
@@ -137,6 +134,7 @@ def _roll(scene: Scene, policy: Policy, projector: Projector) -> dict[str, Any]:
     while not projector.over:
         steps = {name: scene.get_steps(name) for name in scene.behavior_specs}
         for name, begun in projector.tally.add(steps).items():
+            policy.end(name, steps[name][1].agent_id.tolist())
             policy.forget(name, begun)
             decisions, spec = steps[name][0], scene.behavior_specs[name]
             if len(decisions):

@@ -1,7 +1,6 @@
 """Pictures of shapes, by MuJoCo's renderer, offscreen or in a window.
 
-In: shapes and a camera (scenes/core/shapes). Out: frames uint8 [height, width, 3]. Knows no scene: shapes
-go straight into the renderer's list, so nothing has to be simulated by MuJoCo to be drawn.
+Shapes go straight into the renderer's list, so nothing has to be simulated by MuJoCo to be drawn.
 
 MuJoCo's world is right-handed with z up, Unity's left-handed with y up; swapping y and z turns one into the
 other. With P the swap: positions p -> P p, rotations R -> P R P, sizes in the order x, z, y.
@@ -93,6 +92,7 @@ class Stage:
 
     def __init__(self, camera: Camera, width: int, height: int) -> None:
         center = " ".join(f"{part:g}" for part in np.array(camera.target)[_SWAP])
+        # MuJoCo measures shadows and clip planes by the extent of its model; this one is empty.
         self._reach = 0.6 * camera.distance  # of the shadows, m
         text = _STAGE.format(
             fovy=camera.field_of_view,
@@ -159,7 +159,7 @@ def _put(geom: Any, shape: Shape) -> None:
     if shape.kind in (Kind.box, Kind.ellipsoid):
         size[:] = np.array(shape.size)[_SWAP]
     else:
-        size[:2] = shape.size
+        size[:2] = shape.size  # radius and half-length; Unity's y and MuJoCo's z are the axis
 
     mujoco.mjv_initGeom(
         geom,

@@ -1,7 +1,4 @@
-"""Whether a video can be drawn and written, or a window be opened, here: asked before torch is loaded.
-
-In: `PlayConfig` and what the system has. Out: nothing, or a `ConfigError` that names what is missing.
-"""
+"""Whether a video can be drawn and written, or a window be opened, here: checked before torch is loaded."""
 
 from __future__ import annotations
 

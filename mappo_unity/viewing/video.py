@@ -1,6 +1,6 @@
 """Videos: frames into .mp4 (H.264) and .gif files.
 
-In: shapes or frames. Out: a file, which appears under its name only when it is complete. Knows no scene.
+A file appears under its name only when it is complete.
 """
 
 from __future__ import annotations

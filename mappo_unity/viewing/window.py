@@ -1,7 +1,4 @@
-"""A window that shows shapes at the pace of the clock.
-
-In: shapes and a camera. Out: pictures on the display. Knows no scene.
-"""
+"""A window that shows shapes at the pace of the clock."""
 
 from __future__ import annotations
 
@@ -75,7 +72,7 @@ class Window:
             font, corner = mujoco.mjtFont.mjFONT_NORMAL.value, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT.value
             mujoco.mjr_overlay(font, corner, area, "    ".join(caption), "", self._context)
 
-        # After a stall the pace goes on from now, at most one frame behind: nothing is rushed through.
+        # After a stall the pace is kept from now on, at most one frame behind: nothing is rushed through.
         self._due = max(self._due + self._frame_s, time.monotonic() - self._frame_s)
         time.sleep(max(0.0, self._due - time.monotonic()))
 

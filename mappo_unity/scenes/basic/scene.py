@@ -44,7 +44,7 @@ class Basic(Scene):
         """Do nothing: only a new agent stands at the start, env.reset() moves nobody."""
 
     def decides(self) -> bool:
-        """Ask everybody at every tick."""
+        """Let everybody decide at every tick."""
         return True
 
     def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:

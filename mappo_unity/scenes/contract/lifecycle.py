@@ -64,6 +64,7 @@ class Lives:
             )
             self._asked[agent] = name
 
+            # Once it has ended, an agent may come back under another behavior.
             known = self._agents.get(agent)
             if known is not None and not known.ended:
                 require(

@@ -78,6 +78,7 @@ class RaySensor:
         `position`: agents' origins [N, 3], x right, y up, z forward. `yaw`: [N] rad, clockwise from above.
         """
         heading = yaw[:, None] + self.angles
+        # A ray's end is `length` away on the level, and higher or lower than its start.
         level, rise = self.length / self.cast_length, (self.end_offset - self.start_offset) / self.cast_length
         direction = np.empty((*heading.shape, 1, 3))
         direction[:, :, 0, 0] = np.sin(heading) * level

@@ -1,7 +1,7 @@
 """Impulses at contacts of boxes that do not spin and balls that do: all contacts of all areas at once.
 
-Impulses are inelastic, with friction; penetrations are pushed out. Contacts are solved side by
-side in `ROUNDS` rounds; a body's contacts share its mass, so that their impulses cannot add up to too much.
+Impulses are inelastic, with friction; penetrations are pushed out. Contacts are solved side by side in
+`ROUNDS` rounds; a body's contacts share its mass, so that their impulses cannot add up to too much.
 Legend: B bodies, C contacts; vectors are component first. Column B stands for walls: it never moves.
 """
 

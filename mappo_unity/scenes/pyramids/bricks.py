@@ -174,7 +174,7 @@ class PyramidsBricks:
             self.bodies[areas, :, 0] += self.root[areas, :1]
             self.bodies[areas, :, 2] += self.root[areas, 1:]
 
-            # speeds too: a pile that wakes while it falls falls on
+            # speeds too: a pile may wake in the middle of its fall
             self._speeds[areas] = speeds[tick]
             self.clock[areas] += 1
             self._sleep(areas[tick + 1 == FALL_TICKS])

@@ -90,6 +90,7 @@ class Pyramids(Scene):
         goal = bricks.step(bodies.position, bodies.velocity, bodies.yaw, switch)
         bodies.move(awake)
 
+        # after the motion: a pile falls from the next tick on
         if pressed.any():
             areas = np.flatnonzero(pressed)
             self.switch_on[areas] = True

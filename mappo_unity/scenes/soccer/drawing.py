@@ -55,6 +55,7 @@ def shapes(scene: SoccerScene, area: int) -> list[Shape]:
 
 
 def _pitch(blue_closed: bool) -> list[Shape]:
+    # tops differ by a millimetre: what has two surfaces at one place is lit twice
     drawn = [
         box((0, -0.1, 0), (CORNER_X[0], 0.1, SIDE_Z), GRASS, shadow=False),
         box((0, -0.101, 0), (HALF_LENGTH, 0.1, CORNER_Z[1]), GRASS, shadow=False),

@@ -1,0 +1,95 @@
+"""Rounds of a batch as the learner reads them, with the decisions that the batch before left pending.
+
+A decision whose outcome has not arrived when a batch ends is learnt with the next one, under the
+log-probability with which it was taken. Its round is put before the next batch's rounds, with the reward that
+has arrived since; a round in which nobody is pending any more is dropped, so that little is carried.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from mappo_unity import keys
+from mappo_unity.learning.decisions import DecisionView
+
+VALUED = "valued"  # bool [..., A, 1]: the row has a value, see `DecisionView`
+_SUMS = (keys.REWARD, keys.GROUP_REWARD)
+_ENDS = (keys.TERMINATED, keys.TRUNCATED)
+
+
+def has_value(entries: TensorDictBase) -> Tensor:
+    """Return which slots a value counts for: those that act, and departed ones while a team mate acts."""
+    acting = entries.get(keys.ACTING)
+    return acting | (entries.get(keys.DEPARTED) & acting.any(-2, keepdim=True))
+
+
+class CarriedRounds:
+    """The rounds that hold pending decisions, between two batches.
+
+    Args:
+        row_keys: entries that the networks read or wrote.
+    """
+
+    def __init__(self, row_keys: list[str]) -> None:
+        self._row_keys = row_keys
+        self.rounds: TensorDict | None = None  # [P, ..., A]
+
+    def join(self, batch: TensorDictBase) -> TensorDict:
+        """Return the batch's rounds behind the carried ones, ``[P + T, ..., A]``.
+
+        Entries: `row_keys`, ``acting`` (of carried rounds: what is still pending), ``valued``, rewards, ends.
+        """
+        following = batch.get("next")
+        entries = {key: batch.get(key) for key in self._row_keys}
+        entries |= {keys.ACTING: batch.get(keys.ACTING), VALUED: has_value(batch)}
+        entries |= {key: following.get(key) for key in (*_SUMS, *_ENDS)}
+        rounds = TensorDict(entries, batch.batch_size)
+        return rounds if self.rounds is None else torch.cat([self.rounds, rounds], 0)
+
+    def keep(self, rounds: TensorDict, view: DecisionView) -> None:
+        """Keep the rounds in which decisions are pending, with the rewards that have come since."""
+        pending = view.pending
+        where = np.flatnonzero(pending.any(1))
+        if not len(where):
+            self.rounds = None
+            return
+
+        index = torch.from_numpy(where).to(rounds.get(VALUED).device)
+        kept = rounds[index].clone()
+        mask = _like(pending[where], kept.get(VALUED))
+        kept.set(VALUED, mask)
+        kept.set(keys.ACTING, kept.get(keys.ACTING) & mask)
+        for key in _SUMS:
+            flat = rounds.get(key).cpu().numpy().reshape(len(rounds), -1)
+            kept.set(key, _like(np.where(pending, view.rewards(flat), 0)[where], kept.get(key)))
+        for key in _ENDS:
+            kept.set(key, torch.zeros_like(mask))
+        self.rounds = kept
+
+    def void(self, slots: Tensor) -> int:
+        """Forget what is pending of these slots, bool ``[..., A, 1]``; return how many decisions."""
+        if self.rounds is None:
+            return 0
+        acting = self.rounds.get(keys.ACTING)
+        count = int((acting & slots).sum())
+        for key in (keys.ACTING, VALUED):
+            self.rounds.set(key, self.rounds.get(key) & ~slots)
+        return count
+
+    def state_dict(self) -> dict[str, Tensor] | None:
+        """Return what resuming needs."""
+        return None if self.rounds is None else {str(k): v.clone() for k, v in self.rounds.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor] | None) -> None:
+        """Restore what `state_dict` returned."""
+        if state is None:
+            self.rounds = None
+            return
+        self.rounds = TensorDict(state, state[VALUED].shape[:-1])
+
+
+def _like(values: np.ndarray, other: Tensor) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values)).view(other.shape).to(other.device)

@@ -1,0 +1,92 @@
+"""Minibatches that hold about the same number of decisions each."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.data import ReplayBuffer, TensorStorage
+from torchrl.data.replay_buffers import Sampler
+
+from mappo_unity.config.schema import PPOConfig
+
+
+class EvenSampler(Sampler):
+    """Draw each row once an epoch, in random order, cut where the decisions in the rows add up.
+
+    Rows may hold any number of decisions: of a team some members act, of a sequence the end may be padding.
+    Rows in equal numbers would leave a small rest, whose few decisions got a whole optimizer step.
+
+    Args:
+        decisions: int64 ``[R]``, decisions in each row.
+        count: minibatches of an epoch.
+    """
+
+    def __init__(self, decisions: Tensor, count: int) -> None:
+        self.decisions, self.count = decisions, count
+        self._parts: list[Tensor] = []
+        self._ran_out = False
+
+    def sample(self, storage: Any, batch_size: int) -> tuple[Any, dict]:
+        """Return the next minibatch's row numbers; `batch_size` is not looked at."""
+        if not self._parts:
+            self._parts = self._shuffle()
+        part = self._parts.pop()
+        self._ran_out = not self._parts
+        return part, {}
+
+    def _shuffle(self) -> list[Tensor]:
+        order = torch.randperm(len(self.decisions)).to(self.decisions.device)
+        total = self.decisions[order].cumsum(0)
+
+        # the middle of a row's decisions says which share it belongs to
+        middle = total.double() - self.decisions[order].double() / 2
+        share = (middle * self.count / total[-1]).long().clamp_(0, self.count - 1)
+        sizes = torch.bincount(share, minlength=self.count).tolist()
+        return [part for part in order.split(sizes) if len(part)]
+
+    @property
+    def ran_out(self) -> bool:
+        """Whether the epoch is over."""
+        return self._ran_out
+
+    @ran_out.setter
+    def ran_out(self, value: bool) -> None:
+        self._ran_out = value
+
+    def _empty(self) -> None:
+        self._parts = []
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing: between two updates there is no epoch to go on with."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take nothing."""
+
+    def dumps(self, path: Any) -> None:
+        """Write nothing."""
+
+    def loads(self, path: Any) -> None:
+        """Read nothing."""
+
+
+def make_buffer(rows: Any, decisions: Tensor, cfg: PPOConfig) -> ReplayBuffer:
+    """Return a replay buffer over the rows of an update, from which an epoch draws each row once.
+
+    Args:
+        rows: TensorDict ``[R, ...]``, on the device of the networks.
+        decisions: int64 ``[R]``, decisions in each row.
+        cfg: `num_minibatches`, or `minibatch_size`.
+    """
+    count = minibatch_count(cfg, int(decisions.sum()), len(rows))
+    sampler = EvenSampler(decisions, count)
+    # the rows themselves are the storage: nothing is copied in
+    return ReplayBuffer(storage=TensorStorage(rows), sampler=sampler, batch_size=max(1, len(rows) // count))
+
+
+def minibatch_count(cfg: PPOConfig, decisions: int, rows: int) -> int:
+    """Return the minibatches of an epoch over so many decisions in so many rows."""
+    wanted = cfg.num_minibatches or max(1, round(decisions / cfg.minibatch_size))
+    return min(wanted, rows)

@@ -1,0 +1,109 @@
+"""The rows that an update draws its minibatches from: team rows, or with a memory sequences of one agent."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from mappo_unity import keys
+from mappo_unity.config.schema import PPOConfig
+from mappo_unity.learning.decisions import DecisionView
+from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS, MEMBER, TEAM
+from mappo_unity.learning.recurrent import RecurrentCritic
+from mappo_unity.learning.sequences import cut_sequences
+
+_LEARNT = (ACTOR_LEARNS, CRITIC_LEARNS, keys.ADVANTAGE, keys.VALUE_TARGET, keys.VALUE, BASELINE)
+_ROUND, _TEAM_ROW, _VALID = "round", "team_row", "valid"
+
+
+class TeamRows:
+    """Team rows ``[R, A]`` in which anybody learns.
+
+    Args:
+        row_keys: entries that the networks read or wrote.
+    """
+
+    def __init__(self, row_keys: list[str]) -> None:
+        self._keys = row_keys
+
+    def of(self, rounds: TensorDict, view: DecisionView) -> tuple[TensorDictBase, Tensor]:
+        """Return the rows, and how many decisions each holds, int64 ``[R]``."""
+        used = [key for key in (*self._keys, *_LEARNT) if key in rounds.keys()]
+        rows = rounds.select(*used).flatten(0, -2)
+        decisions = rows.get(ACTOR_LEARNS).sum((-2, -1))
+
+        # rows without an action to learn from would only dilute the minibatches
+        learns = decisions > 0
+        return (rows, decisions) if bool(learns.all()) else (rows[learns], decisions[learns])
+
+    def take(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return what the loss reads."""
+        return minibatch
+
+
+class SequenceRows:
+    """Sequences ``[B, L]`` of single agents' decisions.
+
+    Args:
+        row_keys: entries that the networks read or wrote.
+        critic_keys: those that the critic reads.
+        critic: the critic.
+        cfg: `sequence_length`.
+    """
+
+    def __init__(
+        self, row_keys: list[str], critic_keys: list[str], critic: RecurrentCritic | nn.Module, cfg: PPOConfig
+    ) -> None:
+        assert isinstance(critic, RecurrentCritic)
+        self._critic, self._length = critic, cfg.sequence_length
+        self._critic_keys = critic_keys
+        self._keys = [key for key in row_keys if key not in (keys.MEMORY, keys.PRESENT, keys.DEPARTED)]
+        self._rounds: dict[str, Tensor] = {}  # [T, G, A, ...] of all sides
+
+    def of(self, rounds: TensorDict, view: DecisionView) -> tuple[TensorDictBase, Tensor]:
+        """Return where the sequences stand, and how many decisions each holds, int64 ``[B]``."""
+        learns = rounds.get(ACTOR_LEARNS)
+        flat = [rounds.get(key).cpu().numpy().reshape(len(rounds), -1) for key in (keys.FIRST, ACTOR_LEARNS)]
+        found = cut_sequences(view, flat[0], flat[1], self._length)
+
+        # sides and teams become one dimension
+        self._rounds = {
+            str(key): entry.flatten(1, rounds.batch_dims - 2) if rounds.batch_dims > 2 else entry.unsqueeze(1)
+            for key, entry in rounds.items()
+        }
+        team_size = rounds.shape[-1]
+        device = learns.device
+        rounds_at, slots, valid = (
+            torch.from_numpy(array).to(device) for array in (found.rounds, found.slots, found.valid)
+        )
+        rows = {_ROUND: rounds_at, _TEAM_ROW: slots // team_size, MEMBER: slots % team_size, _VALID: valid}
+        sequences = TensorDict(rows, rounds_at.shape[:1])
+        own = self._own(ACTOR_LEARNS, sequences).squeeze(-1) & valid
+        return sequences, own.sum(-1)
+
+    def take(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return what the loss reads of these sequences: entries ``[B, L, ...]``, states ``[B, M]``."""
+        own = [key for key in (*self._keys, *_LEARNT) if key in self._rounds]
+        out = {key: self._own(key, minibatch) for key in own}
+        valid = minibatch.get(_VALID).unsqueeze(-1)
+        for key in (ACTOR_LEARNS, CRITIC_LEARNS):
+            out[key] = out[key] & valid
+
+        begin, team, member = minibatch.get(_ROUND)[:, 0], minibatch.get(_TEAM_ROW), minibatch.get(MEMBER)
+        for key in (keys.MEMORY, *self._critic.state_names):
+            out[key] = self._rounds[key][begin, team, member]
+
+        sees_team = self._critic.sees_team
+        of_critic = {k: self._team(k, minibatch) if sees_team else out[k] for k in self._critic_keys}
+        if self._critic.has_baseline:
+            of_critic[keys.ACTION] = self._team(keys.ACTION, minibatch)
+        out |= {TEAM: TensorDict(of_critic, minibatch.batch_size), MEMBER: member}
+        return TensorDict(out, minibatch.batch_size)
+
+    def _own(self, key: str, at: TensorDictBase) -> Tensor:
+        team, member = at.get(_TEAM_ROW).unsqueeze(-1), at.get(MEMBER).unsqueeze(-1)
+        return self._rounds[key][at.get(_ROUND), team, member]
+
+    def _team(self, key: str, at: TensorDictBase) -> Tensor:
+        return self._rounds[key][at.get(_ROUND), at.get(_TEAM_ROW).unsqueeze(-1)]

@@ -1,0 +1,153 @@
+"""What a critic says of a batch: values of its rows, of terminal observations, of the row after the last.
+
+With a memory the rounds are gone through one by one, and each slot's state is kept for the next batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from mappo_unity import keys
+from mappo_unity.learning.carried import VALUED
+from mappo_unity.learning.poca import PocaCritic
+from mappo_unity.learning.recurrent import BASELINE_STATE, VALUE_STATE, RecurrentCritic
+from mappo_unity.learning.value_norm import ValueNorm
+
+
+@dataclass
+class Values:
+    """Values in the reward's scale; R = carried rounds + rounds of the batch."""
+
+    value: Tensor  # [R, ..., A, 1]
+    end: Tensor  # [R, ..., A, 1]: of terminal observations, where an episode was cut off; 0 elsewhere
+    final: Tensor  # [..., A, 1]: of the row after the last
+    baseline: Tensor | None = None  # [R, ..., A, 1], of a POCA critic
+    states: dict[str, Tensor] = field(default_factory=dict)  # [R, ..., A, M], before each row
+
+
+class ValueReader:
+    """Ask a critic about batches.
+
+    Args:
+        critic: see `learning.actor_critic.make_critic`.
+        norm: turns its output into the reward's scale.
+    """
+
+    def __init__(self, critic: TensorDictModule, norm: ValueNorm) -> None:
+        self.critic, self.norm = critic.module, norm
+        self.keys = [str(key) for key in critic.in_keys]
+        self.states: dict[str, Tensor] = {}  # [..., A, M], before the next batch's first row
+
+    @torch.no_grad()
+    def read(self, rounds: TensorDict, following: TensorDictBase) -> Values:
+        """Return the values of a batch.
+
+        Args:
+            rounds: ``[R, ..., A]``, as `CarriedRounds.join` returns them.
+            following: ``[T, ..., A]``, the batch's ``next``.
+        """
+        if isinstance(self.critic, RecurrentCritic):
+            return self._read_in_turn(self.critic, rounds, following)
+
+        inputs = [rounds.get(key) for key in self.keys]
+        value = self._value(inputs)
+        end = torch.zeros_like(value)
+        where, at = self._cut_off(rounds, following)
+        if len(where):
+            end.flatten(0, -3)[where] = self._value([self._rows(following, key)[at] for key in self.keys])
+
+        baseline = None
+        if isinstance(self.critic, PocaCritic):
+            baseline = self.norm.denormalize(self.critic.baseline(*inputs, rounds.get(keys.ACTION)))
+        return Values(value, end, self._value([following.get(key)[-1] for key in self.keys]), baseline)
+
+    @torch.no_grad()
+    def values_of(self, entries: TensorDictBase) -> Tensor:
+        """Return the values of single observations, by a critic without a memory, in the reward's scale."""
+        return self._value([entries.get(key) for key in self.keys])
+
+    def keep(self, values: Values, pending: Tensor) -> None:
+        """Keep the states for the next batch; slots with a pending decision go back to before it.
+
+        Args:
+            values: what `read` returned.
+            pending: bool ``[R, ..., A, 1]``; a pending row is the last one with a value of its slot.
+        """
+        for name, states in values.states.items():
+            before = torch.where(pending, states, 0.0).sum(0)
+            self.states[name] = torch.where(pending.any(0), before, self.states[name])
+
+    def _value(self, inputs: list[Tensor]) -> Tensor:
+        return self.norm.denormalize(self.critic(*inputs))
+
+    def _read_in_turn(self, critic: RecurrentCritic, rounds: TensorDict, following: TensorDictBase) -> Values:
+        inputs = [rounds.get(key) for key in self.keys]
+        action = rounds.get(keys.ACTION) if critic.has_baseline else None
+        first, valued = rounds.get(keys.FIRST), rounds.get(VALUED)
+
+        outputs, states, after = {}, {}, {}
+        for name in critic.state_names:
+            features = critic.features(name, inputs, action)
+            outputs[name], states[name], after[name] = self._walk(critic, name, features, first, valued)
+
+        value = self.norm.denormalize(critic.values(outputs[VALUE_STATE]))
+        end = torch.zeros_like(value)
+        where, at = self._cut_off(rounds, following)
+        if len(where):
+            # a terminal observation follows the slot's last decision
+            features = critic.features(VALUE_STATE, [self._rows(following, k)[at] for k in self.keys], None)
+            out, _ = critic.step(features, after[VALUE_STATE].flatten(0, -3)[where])
+            end.flatten(0, -3)[where] = self.norm.denormalize(critic.values(out))
+
+        features = critic.features(VALUE_STATE, [following.get(key)[-1] for key in self.keys], None)
+        final = self.norm.denormalize(critic.values(critic.step(features, after[VALUE_STATE][-1])[0]))
+
+        baseline = outputs.get(BASELINE_STATE)
+        if baseline is not None:
+            baseline = self.norm.denormalize(critic.values(baseline))
+        return Values(value, end, final, baseline, states)
+
+    def _walk(
+        self, critic: RecurrentCritic, name: str, features: Tensor, first: Tensor, valued: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return outputs, states before and states after each row; the last of these is kept."""
+        state = self.states.get(name)
+        if state is None or state.shape[:-1] != first.shape[1:-1]:
+            state = features.new_zeros(*first.shape[1:-1], critic.memory.state_size)
+
+        outputs, before, after = [], [], []
+        for row in range(len(features)):
+            state = torch.where(first[row], 0.0, state)
+            before.append(state)
+            out, new = critic.step(features[row], state)
+            outputs.append(out)
+            state = torch.where(valued[row], new, state)
+            after.append(state)
+
+        self.states[name] = state
+        return torch.stack(outputs), torch.stack(before), torch.stack(after)
+
+    @staticmethod
+    def _cut_off(rounds: TensorDict, following: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return the team rows in which anybody was cut off: counted in all rounds, and in the batch's."""
+        at = following.get(keys.TRUNCATED).flatten(0, -3).any(-2).squeeze(-1).nonzero().squeeze(-1)
+        teams = following.get(keys.TRUNCATED).flatten(0, -3).shape[0] // len(following)
+        return at + (len(rounds) - len(following)) * teams, at
+
+    @staticmethod
+    def _rows(entries: TensorDictBase, key: str) -> Tensor:
+        """Return an entry ``[T, ..., A, *]`` as team rows ``[R, A, *]``."""
+        return entries.get(key).flatten(0, entries.batch_dims - 2)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what resuming needs."""
+        return {name: state.clone() for name, state in self.states.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        self.states = dict(state)

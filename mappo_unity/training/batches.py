@@ -1,0 +1,99 @@
+"""Batches: so many decisions collected from an environment, with all that was seen of it on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import Collector
+
+from mappo_unity import keys
+from mappo_unity.config.schema import CollectConfig
+from mappo_unity.envs.rounds import Episode
+from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.training.crashed_episodes import mask_crashed_episodes
+
+
+@dataclass
+class Batch:
+    """A stretch of play: all that a learner and the run's counters need of it.
+
+    Attributes:
+        rounds: ``[T]``, one entry a policy name.
+        episodes: those that finished, for each behavior.
+        void: by policy name bool ``[..., A, 1]``, slots whose episode a crash cut off that had begun before
+            the batch: what is pending of them teaches nothing.
+        restarts: how often players have been started again so far; None: there are no players.
+        dropped_episodes, dropped_steps: what crashes cost in this batch.
+    """
+
+    rounds: TensorDictBase
+    episodes: dict[str, list[Episode]]
+    void: dict[str, Tensor] = field(default_factory=dict)
+    restarts: int | None = None
+    dropped_episodes: int = 0
+    dropped_steps: int = 0
+
+    def of(self, name: str) -> TensorDictBase:
+        """Return one policy name's entries ``[T, ..., A]``, with its own ``next``."""
+        entries = self.rounds.get(name).copy()
+        entries.set("next", self.rounds.get(("next", name)))
+        return entries
+
+    def count_decisions(self, name: str) -> int:
+        """Return how many agent decisions a policy made in it (ML-Agents' steps)."""
+        return int(self.rounds.get((name, keys.ACTING)).sum())
+
+
+class BatchCollector:
+    """Collect batches from where the environment stands.
+
+    Args:
+        collector: plays rounds.
+        env: what is played, below the collector's transforms.
+        cfg: how large a batch is.
+    """
+
+    def __init__(self, collector: Collector, env: UnityEnv, cfg: CollectConfig) -> None:
+        self._collector, self._env, self._cfg = collector, env, cfg
+        self._parts = iter(collector)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return self
+
+    def __next__(self) -> Batch:
+        """Return `collect.rounds` rounds, or as many as hold `collect.batch_size` decisions."""
+        if self._cfg.rounds is not None:
+            return self._with_records(self._play(self._cfg.rounds))
+
+        parts: list[TensorDictBase] = []
+        missing = self._cfg.batch_size
+        while missing > 0:
+            # not everybody is asked in every round: what is missing then is played in further parts
+            parts.append(self._play(-(-missing // max(1, count_present(self._env)))))
+            missing -= sum(int(parts[-1].get((name, keys.ACTING)).sum()) for name in self._env.sides)
+
+        return self._with_records(parts[0] if len(parts) == 1 else torch.cat(parts, 0))
+
+    def _play(self, rounds: int) -> TensorDictBase:
+        self._collector.frames_per_batch = self._collector.requested_frames_per_batch = rounds
+        return next(self._parts)
+
+    def _with_records(self, rounds: TensorDictBase) -> Batch:
+        env = self._env
+        batch = Batch(rounds, env.pop_episodes(), restarts=env.restarts)
+        if env.restarts is None:
+            return batch
+
+        crashes = env.pop_crashed_episodes()
+        batch.dropped_steps, batch.void = mask_crashed_episodes(rounds, crashes, env)
+        batch.dropped_episodes = sum(int(crash.slots.sum()) for crash in crashes)
+        return batch
+
+
+def count_present(env: UnityEnv) -> int:
+    """Return how many agents are there now."""
+    return sum(int(behavior.present.sum()) for behavior in env.behaviors.values())
