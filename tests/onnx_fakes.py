@@ -12,11 +12,11 @@ import torch
 from mappo_unity.config.schema import ModelConfig
 from mappo_unity.learning.actor_critic import make_actor
 from mappo_unity.learning.distributions import ActionLayout
-from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.learning.encoders import ObsLayout, RunningNorm
 from mappo_unity.policies.onnx_graph import build_model
 
 
-def make(sensors, continuous=0, branches=(), joint=False, team_size=1, **model):
+def make(sensors, continuous=0, branches=(), joint=False, team_size=1, head_scale=200, **model):
     """Return an actor whose outputs differ from row to row, its normaliser moved."""
     torch.manual_seed(0)
     layout = ActionLayout(continuous, tuple(branches), joint)
@@ -25,10 +25,11 @@ def make(sensors, continuous=0, branches=(), joint=False, team_size=1, **model):
     net = actor[0].module
     with torch.no_grad():
         if team_size == 1:
-            net.net[-1].weight.mul_(200)
+            net.net[-1].weight.mul_(head_scale)
             net.net[-1].bias.normal_()
             if cfg.normalize_obs and any(len(s) == 1 for s in sensors):
-                net.encoder.norm.update(torch.randn(500, sum(s[0] for s in sensors if len(s) == 1)) * 3 + 1)
+                norm = next(m for m in net.encoder.modules() if isinstance(m, RunningNorm))
+                norm.update(torch.randn(500, sum(s[0] for s in sensors if len(s) == 1)) * 3 + 1)
     return actor
 
 

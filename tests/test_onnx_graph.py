@@ -8,7 +8,7 @@ import pytest
 import torch
 from onnx_fakes import data_of, inputs, make
 
-from mappo_unity.config.schema import Activation
+from mappo_unity.config.schema import Activation, DistributionKind
 from mappo_unity.policies.onnx_check import compare
 from mappo_unity.policies.onnx_graph import ExportError, build_model
 from mappo_unity.policies.onnx_policy import open_session
@@ -87,6 +87,10 @@ CASES = {
     "hybrid, joint": ([[3], [2]], 2, [3, 2], {"joint": True}),
     "grid": ([[3, 6, 7], [4]], 0, [3], {}),
     "image alone": ([[3, 24, 20]], 2, [], {}),
+    "layer norms": ([[3, 6, 7], [4]], 2, [3], {"layer_norm": True}),
+    "layer norms alone": ([[4]], 2, [], {"layer_norm": True, "normalize_obs": False}),
+    "squashed": ([[8]], 2, [], {"action_distribution": DistributionKind.tanh_normal, "head_scale": 20}),
+    "squashed, hybrid": ([[8]], 2, [3, 2], {"action_distribution": DistributionKind.tanh_normal}),
     "image, channels last": ([[4], [22, 20, 3], [2]], 2, [], {}),
 }
 
@@ -181,6 +185,20 @@ def test_sampled_branches_follow_their_probabilities_and_masks():
     masked = np.bincount(draws(actor, 40_000, [0, 1, 1])[:, 0], minlength=3) / 40_000
     np.testing.assert_allclose(masked, [0.0, 0.6, 0.4], atol=0.012)
     assert masked[0] == 0
+
+
+def test_sampled_squashed_actions_are_tanh_of_normals():
+    """tanh(1 + 2 N(0, 1)): median tanh(1), P(< 0) = Phi(-1/2); a raw output of 0 is the initial deviation."""
+    kind = DistributionKind.tanh_normal
+    actor = make([[2]], 1, normalize_obs=False, action_distribution=kind, init_log_std=math.log(2.0))
+    net = actor[0].module
+    with torch.no_grad():
+        net.net[-1].weight.zero_()
+        net.net[-1].bias.copy_(torch.tensor([1.0, 0.0]))
+    actions = draws(actor, 40_000)
+    assert np.abs(actions).max() <= 1.0
+    assert np.median(actions) == pytest.approx(math.tanh(1.0), abs=0.02)
+    assert np.mean(actions < 0) == pytest.approx(0.3085, abs=0.012)
 
 
 def test_images_reach_a_model_channels_first():

@@ -95,6 +95,20 @@ class ValueNormUpdate(Enum):
     minibatch = "minibatch"
 
 
+class WeightInit(Enum):
+    """Initial weights of linear layers; biases are 0."""
+
+    orthogonal = "orthogonal"
+    kaiming_normal = "kaiming_normal"
+
+
+class DistributionKind(Enum):
+    """Distribution of continuous actions."""
+
+    gaussian = "gaussian"
+    tanh_normal = "tanh_normal"
+
+
 class ValueNormKind(Enum):
     """How the critic's targets are normalised."""
 
@@ -255,14 +269,25 @@ class ModelConfig:
     """One categorical over all combinations of the discrete branches, instead of one for each branch."""
     normalize_obs: bool = True
     """Normalise observations by running mean and variance, inside the network."""
+    obs_norm_prior: bool = False
+    """Let the running mean and variance of observations begin with one pseudo-observation of mean 0 and
+    variance 1, as ML-Agents does, instead of with nothing."""
+    layer_norm: bool = False
+    """Layer normalisation of vector observations and after each hidden activation, as in the MAPPO paper."""
+    weight_init: WeightInit = WeightInit.orthogonal
+    """Initial weights: orthogonal with gain sqrt 2, output layers 0.01 (orthogonal), or ML-Agents' He normal
+    with gain 1, means 0.2, branches 0.1, a value layer Xavier uniform (kaiming_normal)."""
+    action_distribution: DistributionKind = DistributionKind.gaussian
+    """Continuous actions: a Gaussian that the environment clips, its deviation a weight of its own
+    (gaussian), or a Gaussian squashed by tanh, its deviation an output of the network (tanh_normal)."""
     memory: MemoryKind = MemoryKind.none
     """Memory of the actor and the critic: lstm or gru, one layer before the heads; none: they see the newest
     observation only."""
     memory_size: int = 128
     """Width of the memory's state (as in ML-Agents: an LSTM's hidden and cell state are half as wide)."""
     init_log_std: float = 0.0
-    """Logarithm of the initial standard deviation of continuous actions (before the division by 3), from -5
-    to 2, where training keeps it."""
+    """Logarithm of the initial standard deviation of continuous actions (before the division by 3; with
+    tanh_normal before tanh), from -5 to 2, where training keeps it."""
 
     def __post_init__(self) -> None:
         # null and [] mean model.hidden, which is checked itself

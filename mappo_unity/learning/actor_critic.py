@@ -7,6 +7,7 @@ Both are TensorDict modules, which read observations (and ``action_mask``) and w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -17,11 +18,11 @@ from torchrl.envs import ExplorationType, exploration_type
 from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
-from mappo_unity.config.schema import LOG_STD_RANGE, CriticKind, MemoryKind, ModelConfig
+from mappo_unity.config.schema import LOG_STD_RANGE, CriticKind, DistributionKind, MemoryKind, ModelConfig
 from mappo_unity.learning.critics import CentralCritic, LocalCritic, PooledCritic
-from mappo_unity.learning.distributions import ActionDistribution, ActionLayout
+from mappo_unity.learning.distributions import ActionDistribution, ActionLayout, state_log_std
 from mappo_unity.learning.encoders import Encoder, ObsLayout
-from mappo_unity.learning.mlp import make_mlp
+from mappo_unity.learning.mlp import apply_options, init_head, make_mlp
 from mappo_unity.learning.poca import PocaCritic
 from mappo_unity.learning.recurrent import RecurrentActor, RecurrentCritic, output_size
 
@@ -33,12 +34,14 @@ class Actor(nn.Module):
         super().__init__()
         self.encoder = Encoder(obs, cfg.normalize_obs)
 
-        outputs = layout.continuous + layout.num_logits
+        outputs = layout.num_means + layout.num_logits
         # the small last gain makes first actions almost independent of what is observed
         self.net = make_mlp(self.encoder.size, list(cfg.hidden), outputs, cfg.activation, last_gain=0.01)
 
-        self.layout = layout
-        self.log_std = nn.Parameter(torch.full((layout.continuous,), float(cfg.init_log_std)))
+        self.layout, self.init_log_std = layout, float(cfg.init_log_std)
+        apply_options(self, cfg, layout.num_means)
+        if not layout.squashed:
+            self.log_std = nn.Parameter(torch.full((layout.continuous,), self.init_log_std))
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return distribution parameters."""
@@ -51,6 +54,10 @@ class Actor(nn.Module):
             return out
 
         # means, logarithms of deviations, logits: the order that `ActionDistribution` reads
+        if self.layout.squashed:
+            log_std = state_log_std(out[..., size : 2 * size], self.init_log_std)
+            return torch.cat([out[..., :size], log_std, out[..., 2 * size :]], -1)
+
         log_std = self._bounded_log_std().expand(*out.shape[:-1], size)
         if not self.layout.branches:
             return torch.cat([out, log_std], -1)
@@ -60,7 +67,8 @@ class Actor(nn.Module):
     @torch.no_grad()
     def project(self) -> None:
         """Take the deviations back into their range, after a step of the optimizer."""
-        self.log_std.clamp_(*LOG_STD_RANGE)
+        if not self.layout.squashed:
+            self.log_std.clamp_(*LOG_STD_RANGE)
 
     def _bounded_log_std(self) -> Tensor:
         bounded = self.log_std.clamp(*LOG_STD_RANGE).detach()
@@ -168,10 +176,14 @@ def project(policy: nn.Module) -> None:
 
 def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig) -> UnityActor:
     """Build the policy as a TorchRL actor over the entries of one policy name."""
+    squashed = cfg.action_distribution is DistributionKind.tanh_normal and layout.continuous > 0
+    layout = replace(layout, squashed=squashed)
+
     if cfg.share_parameters or team_size == 1:
         net: nn.Module = Actor(obs, layout, cfg)
         if cfg.memory is not MemoryKind.none:
             net = RecurrentActor(net, cfg)
+            init_head(net.head, cfg, layout.num_means)
     else:
         net = PerMember([Actor(obs, layout, cfg) for _ in range(team_size)], obs.team_dims)
     return UnityActor(net, obs.keys, layout)
@@ -193,6 +205,7 @@ def make_critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: Action
         net = _critic(obs, team_size, cfg, layout)
         if cfg.memory is not MemoryKind.none:
             net = RecurrentCritic(net, cfg, sees_team=not local)
+            init_head(net.value_heads[0], cfg)
     else:
         nets = [_critic(obs, team_size, cfg, layout) for _ in range(team_size)]
         net = PerMember(nets, obs.team_dims if local else None)
@@ -202,12 +215,14 @@ def make_critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: Action
 
 def _critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: ActionLayout) -> nn.Module:
     if team_size == 1 or cfg.critic is CriticKind.local:
-        return LocalCritic(obs, cfg)
-    if cfg.critic is CriticKind.central:
-        return CentralCritic(obs, team_size, cfg)
-    if cfg.critic is not CriticKind.poca:
-        return PooledCritic(obs, team_size, cfg)
-    return PocaCritic(obs, layout, team_size, cfg, head_size=output_size(cfg))
+        net: nn.Module = LocalCritic(obs, cfg)
+    elif cfg.critic is CriticKind.central:
+        net = CentralCritic(obs, team_size, cfg)
+    elif cfg.critic is not CriticKind.poca:
+        net = PooledCritic(obs, team_size, cfg)
+    else:
+        net = PocaCritic(obs, layout, team_size, cfg, head_size=output_size(cfg))
+    return apply_options(net, cfg)
 
 
 class JointPolicy(TensorDictModuleBase):

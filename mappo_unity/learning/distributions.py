@@ -4,7 +4,7 @@ An action is one tensor ``[..., C + K]``: C continuous columns, then K branch in
 action is int64, any other float32 (branch indices up to 2**24 are exact in it).
 
 Continuous columns are Gaussian before the environment clips them to +-3 and divides by 3, as in
-ML-Agents' exported policies.
+ML-Agents' exported policies. Squashed ones are 3 tanh(Gaussian), which that clip leaves alone.
 """
 
 from __future__ import annotations
@@ -13,13 +13,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from mlagents_envs.base_env import ActionSpec
 from torch import Tensor
 from torch.distributions import Distribution
+from torch.nn.functional import softplus
 
 CONTINUOUS_LIMIT = 3.0  # ML-Agents: clip to +-3, then divide by 3 (mlagents.trainers torch distributions)
+TANH_LIMIT = 1 - 1e-6  # a squashed action is not brought nearer to its limit: float32 could not invert it
+LEAST_SCALE = 0.01  # of a state-dependent deviation, as a share of the initial one
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+# nodes and weights (which sum to 1) of Gauss-Hermite quadrature: means under N(0, 1) are weighted sums
+_NODES, _WEIGHTS = (x.tolist() for x in np.polynomial.hermite_e.hermegauss(32))
+_WEIGHTS = [w / math.sqrt(2 * math.pi) for w in _WEIGHTS]
 
 
 @dataclass(frozen=True)
@@ -27,12 +35,14 @@ class ActionLayout:
     """Sizes of an action: C continuous columns and the sizes of K discrete branches.
 
     With ``joint`` there is one categorical over all combinations of the branches (27 for 3x3x3)
-    instead of one for each; the action itself still holds one index a branch.
+    instead of one for each; the action itself still holds one index a branch. With ``squashed``
+    continuous columns go through tanh.
     """
 
     continuous: int
     branches: tuple[int, ...]
     joint: bool = False
+    squashed: bool = False
 
     @classmethod
     def from_spec(cls, spec: ActionSpec, joint: bool = False) -> ActionLayout:
@@ -49,6 +59,11 @@ class ActionLayout:
     def num_logits(self) -> int:
         """Number of logits."""
         return sum(self.categoricals)
+
+    @property
+    def num_means(self) -> int:
+        """Number of a network's outputs for continuous columns: squashed ones have a deviation each, too."""
+        return self.continuous * (2 if self.squashed else 1)
 
     @property
     def num_params(self) -> int:
@@ -124,11 +139,11 @@ class ActionDistribution(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        """The most likely action ``[..., C + K]``."""
+        """The most likely action ``[..., C + K]``; of squashed columns the median."""
         if not self.layout.branches:
-            return self.loc
+            return self.squash(self.loc)
         categories = torch.stack([p.argmax(-1) for p in self.log_probs], -1)
-        return self._join(self.loc, self.layout.to_branches(categories))
+        return self._join(self.squash(self.loc), self.layout.to_branches(categories))
 
     @property
     def deterministic_sample(self) -> Tensor:
@@ -169,7 +184,7 @@ class ActionDistribution(Distribution):
         """
         total = torch.zeros(())
         if self.layout.continuous:
-            columns = self.log_std + 0.5 + _LOG_SQRT_2PI
+            columns = self.log_std + 0.5 + _LOG_SQRT_2PI + self._mean_log_slope()
             total = columns.mean(-1) if mean else columns.sum(-1)
 
         for log_probs in self.log_probs:
@@ -184,16 +199,38 @@ class ActionDistribution(Distribution):
 
         return [part.log_softmax(-1) for part in logits.split(list(self.layout.categoricals), -1)]
 
+    def squash(self, value: Tensor) -> Tensor:
+        """Return continuous columns of Gaussian values ``[..., C]``: 3 tanh of them, or they themselves."""
+        if not self.layout.squashed:
+            return value
+        return CONTINUOUS_LIMIT * value.tanh().clamp(-TANH_LIMIT, TANH_LIMIT)
+
+    def _mean_log_slope(self) -> Tensor | float:
+        """Mean logarithm of the slope of `squash`, by which it changes the entropy, for each column.
+
+        It has no closed form; quadrature gives it without the noise of drawing it.
+        """
+        if not self.layout.squashed:
+            return 0.0
+        std = torch.exp(self.log_std)
+        return sum(w * _log_slope(self.loc + std * x) for x, w in zip(_NODES, _WEIGHTS))
+
     def _continuous_log_prob(self, value: Tensor) -> Tensor:
         return self._column_log_probs(value).sum(-1)
 
     def _column_log_probs(self, value: Tensor) -> Tensor:
+        slope: Tensor | float = 0.0
+        if self.layout.squashed:
+            value = (value / CONTINUOUS_LIMIT).clamp(-TANH_LIMIT, TANH_LIMIT).atanh()
+            slope = _log_slope(value)
+
         z = (value - self.loc) * torch.exp(-self.log_std)
-        return -0.5 * z * z - self.log_std - _LOG_SQRT_2PI
+        return -0.5 * z * z - self.log_std - _LOG_SQRT_2PI - slope
 
     def _sample_continuous(self, sample_shape: Sequence[int]) -> Tensor:
         shape = torch.Size(sample_shape) + self.loc.shape
-        return self.loc + torch.exp(self.log_std) * torch.randn(shape, device=self.loc.device)
+        noise = torch.randn(shape, device=self.loc.device)
+        return self.squash(self.loc + torch.exp(self.log_std) * noise)
 
     @staticmethod
     def _sample_category(log_probs: Tensor, sample_shape: Sequence[int]) -> Tensor:
@@ -206,3 +243,24 @@ class ActionDistribution(Distribution):
         if not self.layout.continuous:
             return branches
         return torch.cat([continuous, branches.to(continuous.dtype)], -1)
+
+
+def state_log_std(raw: Tensor, init_log_std: float) -> Tensor:
+    """Return the log deviations of network outputs ``raw``: at 0 they are ``init_log_std``.
+
+    A biased softplus, TorchRL's ``biased_softplus_1.0`` where ``init_log_std`` is 0.
+    """
+    shift, least = scale_shift(init_log_std)
+    return (softplus(raw + shift) + least).log()
+
+
+def scale_shift(init_log_std: float) -> tuple[float, float]:
+    """Return ``shift`` and ``least`` of the deviation ``softplus(raw + shift) + least``."""
+    scale = math.exp(init_log_std)
+    least = LEAST_SCALE * scale
+    return math.log(math.expm1(scale - least)), least
+
+
+def _log_slope(value: Tensor) -> Tensor:
+    """Logarithm of the slope of ``3 tanh`` at ``value``: 1 - tanh(x)**2 = 4 / (exp(x) + exp(-x))**2."""
+    return math.log(4 * CONTINUOUS_LIMIT) - 2 * (value + softplus(-2 * value))

@@ -92,6 +92,15 @@ class RunningNorm(nn.Module):
         self.register_buffer("var", torch.ones(size))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("inv_std", torch.ones(size))
+        self.epsilon = 1e-6  # added to the variance
+
+    def begin_with_prior(self) -> None:
+        """Count one pseudo-observation of mean 0 and variance 1 (ML-Agents' Normalizer).
+
+        It keeps the variance of a feature that never changes above 0, so nothing is added to it.
+        """
+        self.count.fill_(1.0)
+        self.epsilon = 0.0
 
     def forward(self, x: Tensor) -> Tensor:
         """Return ``x`` ``[..., size]``, normalised."""
@@ -111,7 +120,7 @@ class RunningNorm(nn.Module):
         self.var.copy_(var + delta**2 * weight * (1 - weight))
         self.mean.add_(delta * weight)
         self.count.copy_(count)
-        self.inv_std.copy_(1.0 / torch.sqrt(self.var + 1e-6))
+        self.inv_std.copy_(1.0 / torch.sqrt(self.var + self.epsilon))
 
 
 class Encoder(nn.Module):
@@ -119,10 +128,10 @@ class Encoder(nn.Module):
 
     def __init__(self, layout: ObsLayout, normalize: bool) -> None:
         super().__init__()
-        self.norm = RunningNorm(layout.vector) if normalize and layout.vector else nn.Identity()
+        self.norm: nn.Module = RunningNorm(layout.vector) if normalize and layout.vector else nn.Identity()
         dims = layout.channel_dims or (FIRST,) * len(layout.images)
         self.images = nn.ModuleList([ImageEncoder(s, dim) for (_, s), dim in zip(layout.images, dims)])
-        self.has_vector = layout.vector > 0
+        self.vector, self.has_vector = layout.vector, layout.vector > 0
         self.size = layout.vector + IMAGE_FEATURES * len(layout.images)
 
     def forward(self, *obs: Tensor) -> Tensor:

@@ -1,10 +1,16 @@
-"""Layers and their initial weights."""
+"""Layers, their initial weights, and options that change a network after it was built.
+
+`apply_options` walks a network's parts, so that every actor and critic obeys ``layer_norm``,
+``weight_init`` and ``obs_norm_prior`` alike; with their defaults it changes nothing.
+"""
 
 from __future__ import annotations
 
+import torch
 from torch import nn
 
-from mappo_unity.config.schema import Activation
+from mappo_unity.config.schema import Activation, ModelConfig, WeightInit
+from mappo_unity.learning.encoders import Encoder, ImageEncoder, RunningNorm
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {
     Activation.tanh: nn.Tanh,
@@ -12,6 +18,9 @@ ACTIVATIONS: dict[Activation, type[nn.Module]] = {
     Activation.silu: nn.SiLU,
     Activation.elu: nn.ELU,
 }
+
+# ML-Agents' gains of He normal weights (trainers/torch_entities: distributions.py, encoders.py)
+CONTINUOUS_GAIN, BRANCH_GAIN, IMAGE_GAIN = 0.2, 0.1, 1.41
 
 
 def make_mlp(
@@ -31,3 +40,82 @@ def linear(size: int, outputs: int, gain: float) -> nn.Linear:
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer
+
+
+def apply_options(net: nn.Module, cfg: ModelConfig, continuous: int | None = None) -> nn.Module:
+    """Give one network what ``layer_norm``, ``weight_init`` and ``obs_norm_prior`` ask for.
+
+    Args:
+        net: an actor or a critic of one member, its last Linear the output layer.
+        cfg: the options.
+        continuous: of an actor, how many of its first outputs belong to continuous actions; None: a
+            critic.
+
+    Returns:
+        The same network, changed.
+    """
+    # before the layer norms, which bring parts of their own
+    if cfg.weight_init is WeightInit.kaiming_normal and not getattr(net, "draws_own_weights", False):
+        init_kaiming(net)
+        init_head(_linears(net)[-1], cfg, continuous)
+    if cfg.layer_norm:
+        add_layer_norms(net)
+    if cfg.obs_norm_prior:
+        for part in net.modules():
+            if isinstance(part, RunningNorm):
+                part.begin_with_prior()
+    return net
+
+
+@torch.no_grad()
+def init_head(layer: nn.Linear, cfg: ModelConfig, continuous: int | None = None) -> None:
+    """Draw an output layer's weights as ``weight_init`` asks for; see `apply_options`."""
+    if cfg.weight_init is not WeightInit.kaiming_normal:
+        return
+
+    if continuous is None:
+        nn.init.xavier_uniform_(layer.weight)
+    else:
+        nn.init.kaiming_normal_(layer.weight, nonlinearity="linear")
+        layer.weight[:continuous].mul_(CONTINUOUS_GAIN)
+        layer.weight[continuous:].mul_(BRANCH_GAIN)
+
+
+@torch.no_grad()
+def init_kaiming(net: nn.Module) -> None:
+    """Draw hidden weights as ML-Agents does; `PocaCritic` does so itself, attention keeps torch's."""
+    for layer in _linears(net):
+        nn.init.kaiming_normal_(layer.weight, nonlinearity="linear")
+        nn.init.zeros_(layer.bias)
+
+    for part in net.modules():
+        if isinstance(part, ImageEncoder):
+            for layer in _linears(part):
+                layer.weight.mul_(IMAGE_GAIN)
+
+
+def add_layer_norms(net: nn.Module) -> None:
+    """Put a LayerNorm on vector observations and behind every activation that follows a Linear."""
+    activations = tuple(ACTIVATIONS.values())
+    images = _inside(net, ImageEncoder)
+    for parent in list(net.modules()):
+        if isinstance(parent, Encoder) and parent.has_vector:
+            parent.norm = nn.Sequential(parent.norm, nn.LayerNorm(parent.vector))
+
+        width = None
+        for name, part in list(parent.named_children()):
+            if isinstance(part, nn.Linear):
+                width = part.out_features
+            elif isinstance(part, activations) and width is not None and part not in images:
+                setattr(parent, name, nn.Sequential(part, nn.LayerNorm(width)))
+
+
+def _linears(net: nn.Module) -> list[nn.Linear]:
+    """The Linear layers of a network in the order in which they were made, without attention's own."""
+    attention = _inside(net, nn.MultiheadAttention)
+    return [part for part in net.modules() if isinstance(part, nn.Linear) and part not in attention]
+
+
+def _inside(net: nn.Module, kind: type[nn.Module]) -> set[nn.Module]:
+    """All parts of the parts of a kind."""
+    return {inner for part in net.modules() if isinstance(part, kind) for inner in part.modules()}

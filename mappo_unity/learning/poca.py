@@ -41,6 +41,8 @@ class PocaCritic(nn.Module):
             it; None: the last width.
     """
 
+    draws_own_weights = True  # whatever model.weight_init says
+
     def __init__(
         self,
         obs: ObsLayout,

@@ -105,7 +105,7 @@ def _run(
 def _continuous_error(expected: ActionDistribution, found: dict[str, torch.Tensor]) -> float:
     if "continuous" not in found:
         return 0.0
-    wanted = expected.loc.clamp(-CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT
+    wanted = expected.squash(expected.loc).clamp(-CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT
     return float((found["continuous"] - wanted).abs().max())
 
 
@@ -130,7 +130,7 @@ def _compare_continuous(expected: ActionDistribution, drawn: list[dict[str, torc
     draws = torch.stack([d["continuous"] for d in drawn]) * CONTINUOUS_LIMIT
     std = expected.log_std.exp()
     for sigmas in (-1.0, 0.0, 1.0):
-        limit = expected.loc + sigmas * std
+        limit = expected.squash(expected.loc + sigmas * std)
         inside = limit.abs() < CONTINUOUS_LIMIT - 1e-3
         share = 0.5 * (1 + math.erf(sigmas / math.sqrt(2)))
 

@@ -24,16 +24,14 @@ from torch import Tensor, nn
 from mappo_unity import __version__
 from mappo_unity.config.option_table import with_article
 from mappo_unity.config.packages import PER_MEMBER, ExportError, import_package
-from mappo_unity.learning.actor_critic import LOG_STD_RANGE, Actor, PerMember
-from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
+from mappo_unity.learning.actor_critic import Actor, PerMember
 from mappo_unity.learning.encoders import OBS_CLIP, Encoder
 from mappo_unity.learning.recurrent import RecurrentActor
+from mappo_unity.policies.onnx_actions import BATCH, add_actions
 from mappo_unity.policies.onnx_memory import add_memory
 
 FORMAT = 3.0  # ML-Agents' ModelApiVersion.MLAgents2_0: an input for each sensor, actions drawn in the graph
 OPSET, IR_VERSION = 9, 4  # those of the files that ML-Agents writes
-FORBIDDEN = 1e8  # what ML-Agents takes off the logit of a forbidden action
-BATCH = "batch"
 
 
 def build_model(
@@ -56,7 +54,7 @@ def build_model(
     onnx = import_package("onnx")
     memory = actor.memory if isinstance(actor, RecurrentActor) else None
     network = _check_network(actor.actor if isinstance(actor, RecurrentActor) else actor)
-    graph = _Graph(onnx)
+    graph = Graph(onnx)
     graph.tell("version_number", [FORMAT], [1])
     graph.tell("memory_size", [float(memory.state_size if memory is not None else 0)], [1])
 
@@ -67,10 +65,7 @@ def build_model(
     hidden = graph.layers(body, _features(graph, network.encoder, sensors), "net")
     if memory is not None:
         hidden = add_memory(graph, memory, hidden, BATCH)
-    if network.layout.continuous:
-        _continuous_head(graph, hidden, head, network.log_std, network.layout.continuous)
-    if network.layout.branches:
-        _discrete_heads(graph, hidden, head, network.layout)
+    add_actions(graph, hidden, head, network)
 
     model = onnx.helper.make_model(
         onnx.helper.make_graph(graph.nodes, name, graph.inputs, graph.outputs, graph.weights),
@@ -85,7 +80,7 @@ def build_model(
     return model
 
 
-class _Graph:
+class Graph:
     """Nodes, weights, inputs and outputs as they are added; names what nobody named."""
 
     def __init__(self, onnx: Any) -> None:
@@ -157,13 +152,13 @@ class _Graph:
 # --- layers
 
 
-def _norm(graph: _Graph, layer: Any, x: str, name: str) -> str:
+def _norm(graph: Graph, layer: Any, x: str, name: str) -> str:
     centred = graph.node("Sub", [x, graph.constant(f"{name}.mean", layer.mean)])
     scaled = graph.node("Mul", [centred, graph.constant(f"{name}.inv_std", layer.inv_std)])
     return graph.node("Clip", [scaled], min=-OBS_CLIP, max=OBS_CLIP)
 
 
-def _conv(graph: _Graph, layer: Any, x: str, name: str) -> str:
+def _conv(graph: Graph, layer: Any, x: str, name: str) -> str:
     if layer.groups != 1 or layer.padding_mode != "zeros" or isinstance(layer.padding, str):
         raise ExportError(f"layer {name}: only plain convolutions (one group, zero padding) can be exported")
     inputs = [x, graph.constant(f"{name}.weight", layer.weight), graph.constant(f"{name}.bias", layer.bias)]
@@ -171,9 +166,21 @@ def _conv(graph: _Graph, layer: Any, x: str, name: str) -> str:
     return graph.node("Conv", inputs, pads=[*layer.padding, *layer.padding], group=1, **sizes)  # begins, ends
 
 
-_LAYERS: dict[str, Callable[[_Graph, Any, str, str], str]] = {
+def _layer_norm(graph: Graph, layer: Any, x: str, name: str) -> str:
+    # of operators that opset 9 has
+    centred = graph.node("Sub", [x, graph.node("ReduceMean", [x], axes=[1], keepdims=1)])
+    square = graph.node("Mul", [centred, centred])
+    var = graph.node("ReduceMean", [square], axes=[1], keepdims=1)
+    std = graph.node("Sqrt", [graph.node("Add", [var, graph.constant(f"{name}.eps", layer.eps)])])
+    normed = graph.node("Div", [centred, std])
+    scaled = graph.node("Mul", [normed, graph.constant(f"{name}.weight", layer.weight)])
+    return graph.node("Add", [scaled, graph.constant(f"{name}.bias", layer.bias)])
+
+
+_LAYERS: dict[str, Callable[[Graph, Any, str, str], str]] = {
     "Identity": lambda graph, layer, x, name: x,
     "RunningNorm": _norm,
+    "LayerNorm": _layer_norm,
     "Sequential": lambda graph, layer, x, name: graph.layers(list(layer), x, name),
     "Linear": lambda graph, layer, x, name: graph.gemm(x, layer.weight, layer.bias, name),
     "Conv2d": _conv,
@@ -198,7 +205,7 @@ def _check_network(actor: nn.Module) -> Actor:
     return actor
 
 
-def _features(graph: _Graph, encoder: Encoder, sensors: Sequence[Sequence[int]]) -> str:
+def _features(graph: Graph, encoder: Encoder, sensors: Sequence[Sequence[int]]) -> str:
     """Add the inputs and what encodes them; return what the MLP takes."""
     vectors, features = [], []
     images = iter(encoder.images)
@@ -222,90 +229,3 @@ def channels_first(shape: Sequence[int]) -> tuple[int, ...]:
     """Turn the shape ``H, W, C`` of an image into ``C, H, W``, as Unity's models take it."""
     height, width, channels = shape
     return channels, height, width
-
-
-# --- actions
-
-
-def _continuous_head(graph: _Graph, hidden: str, head: nn.Linear, log_std: Tensor, size: int) -> None:
-    """Add ``clip(mean + std * N(0, 1), +-3) / 3``, and the same without the noise."""
-    mean = graph.gemm(hidden, head.weight[:size], head.bias[:size], "mean")
-    std = log_std.detach().clamp(*LOG_STD_RANGE).exp()[None]
-    noise = graph.node("RandomNormalLike", [mean], dtype=1)  # float32
-    sample = graph.node("Add", [mean, graph.node("Mul", [noise, graph.constant("std", std)])])
-    limit = graph.constant("limit", CONTINUOUS_LIMIT)
-
-    def scaled(value: str, name: str) -> None:
-        clipped = graph.node("Clip", [value], min=-CONTINUOUS_LIMIT, max=CONTINUOUS_LIMIT)
-        graph.output(graph.node("Div", [clipped, limit], name), [BATCH, size])
-
-    scaled(sample, "continuous_actions")
-    graph.tell("continuous_action_output_shape", [float(size)], [1])
-    scaled(mean, "deterministic_continuous_actions")
-
-
-def _discrete_heads(graph: _Graph, hidden: str, head: nn.Linear, layout: ActionLayout) -> None:
-    """Add a draw and the mode of every branch."""
-    masks = graph.input("action_masks", [sum(layout.branches)])
-    # `_categorical` takes these by name, for every branch.
-    graph.constant("one", 1.0)
-    graph.constant("forbidden", FORBIDDEN)
-    weight, bias = head.weight[layout.continuous :], head.bias[layout.continuous :]
-    if layout.joint:
-        draw, mode = _joint_categorical(graph, graph.gemm(hidden, weight, bias, "branches"), masks, layout)
-    else:
-        draw, mode = _branch_categoricals(graph, hidden, weight, bias, masks, layout)
-    count = len(layout.branches)
-    graph.output(draw, [BATCH, count], integer=True)
-    graph.tell("discrete_action_output_shape", [[float(size) for size in layout.branches]], [1, count])
-    graph.output(mode, [BATCH, count], integer=True)
-
-
-def _branch_categoricals(
-    graph: _Graph, hidden: str, weight: Tensor, bias: Tensor, masks: str, layout: ActionLayout
-) -> tuple[str, str]:
-    """Add a categorical for each branch."""
-    draws, modes, start = [], [], 0
-    for branch, size in enumerate(layout.branches):
-        end = start + size
-        logits = graph.gemm(hidden, weight[start:end], bias[start:end], f"branches.{branch}")
-        mask = graph.node("Slice", [masks], axes=[1], starts=[start], ends=[end])
-        draw, mode = _categorical(graph, logits, mask)
-        draws.append(draw)
-        modes.append(mode)
-        start = end
-    draw = graph.node("Concat", draws, "discrete_actions", axis=1)
-    return draw, graph.node("Concat", modes, "deterministic_discrete_actions", axis=1)
-
-
-def _joint_categorical(graph: _Graph, logits: str, masks: str, layout: ActionLayout) -> tuple[str, str]:
-    """Add one categorical over all combinations of the branches, in the order of `ActionLayout`."""
-    combinations = np.stack(np.unravel_index(np.arange(layout.num_logits), layout.branches), 1)
-    offsets = np.cumsum([0, *layout.branches[:-1]])
-    parts = [
-        graph.node("Gather", [masks, graph.constant(f"columns.{k}", column, np.int64)], axis=1)
-        for k, column in enumerate((combinations + offsets).T)
-    ]
-
-    # A combination is allowed where all of its branches are: the product of their masks.
-    mask = parts[0]
-    for part in parts[1:]:
-        mask = graph.node("Mul", [mask, part])
-
-    table = graph.constant("combinations", combinations, np.int64)
-    draw, mode = _categorical(graph, logits, mask)
-    names = (draw, "discrete_actions"), (mode, "deterministic_discrete_actions")
-    chosen = [
-        graph.node("Squeeze", [graph.node("Gather", [table, index], axis=0)], name, axes=[1])
-        for index, name in names
-    ]
-    return chosen[0], chosen[1]
-
-
-def _categorical(graph: _Graph, logits: str, mask: str) -> tuple[str, str]:
-    """Add a draw and the mode, int64 ``[batch, 1]``, of ``softmax(logit * mask - 1e8 * (1 - mask))``."""
-    penalty = graph.node("Mul", [graph.node("Sub", ["one", mask]), "forbidden"])
-    masked = graph.node("Sub", [graph.node("Mul", [logits, mask]), penalty])
-    probs = graph.node("Softmax", [masked], axis=1)
-    draw = graph.node("Multinomial", [graph.node("Log", [probs])], dtype=7, sample_size=1)  # int64
-    return draw, graph.node("ArgMax", [probs], axis=1, keepdims=1)
