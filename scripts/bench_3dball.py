@@ -23,7 +23,7 @@ from torch import nn
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
-from mappo_unity.learning.mlp import make_mlp
+from mappo_unity.learning.networks.mlp import make_mlp
 from mappo_unity.scenes import make_scene
 from mappo_unity.training.setup import entries_of, set_up
 from mappo_unity.training.trainer import train

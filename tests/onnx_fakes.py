@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from mappo_unity.config.schema import ModelConfig
-from mappo_unity.learning.actor_critic import make_actor
-from mappo_unity.learning.distributions import ActionLayout
-from mappo_unity.learning.encoders import ObsLayout, RunningNorm
+from mappo_unity.learning.networks.actor_critic import make_actor
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout, RunningNorm
 from mappo_unity.policies.onnx_graph import build_model
 
 

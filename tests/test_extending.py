@@ -18,7 +18,7 @@ from mappo_unity.config.compose import compose_config
 from mappo_unity.config.option_table import option_table
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning import encoders
+from mappo_unity.learning.networks import encoders
 from mappo_unity.runs import checkpoint
 from mappo_unity.scenes.check import main as check_main
 from mappo_unity.training.outcome import FINISHED

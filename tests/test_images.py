@@ -23,10 +23,10 @@ from onnx_fakes import data_of
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import ModelConfig
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning import encoders
-from mappo_unity.learning.actor_critic import make_actor
-from mappo_unity.learning.distributions import ActionLayout
-from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.learning.networks import encoders
+from mappo_unity.learning.networks.actor_critic import make_actor
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.policies.export import export_checkpoint
 from mappo_unity.policies.layouts import check_layout, describe_spec, without_channels
 from mappo_unity.policies.onnx_check import compare

@@ -9,9 +9,9 @@ from fakes import Record, ScriptedEnv
 
 from mappo_unity.config.schema import ModelConfig
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.actor_critic import make_actor
-from mappo_unity.learning.distributions import ActionLayout
-from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.learning.networks.actor_critic import make_actor
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.policies.episodes import play
 from mappo_unity.policies.layouts import describe_spec
 from mappo_unity.policies.members import MemberTable

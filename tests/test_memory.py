@@ -26,7 +26,7 @@ from mappo_unity.config.schema import (
 )
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.decisions import DecisionView
-from mappo_unity.learning.recurrent import Memory
+from mappo_unity.learning.networks.recurrent import Memory
 from mappo_unity.learning.sequences import cut_sequences
 from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.runs import checkpoint

@@ -25,9 +25,9 @@ from mappo_unity.config.schema import (
     Schedule,
     WeightInit,
 )
-from mappo_unity.learning.actor_critic import Actor, make_actor, make_critic
-from mappo_unity.learning.distributions import ActionDistribution, ActionLayout, state_log_std
-from mappo_unity.learning.encoders import ObsLayout, RunningNorm
+from mappo_unity.learning.networks.actor_critic import Actor, make_actor, make_critic
+from mappo_unity.learning.networks.distributions import ActionDistribution, ActionLayout, state_log_std
+from mappo_unity.learning.networks.encoders import ObsLayout, RunningNorm
 from mappo_unity.policies.onnx_policy import OnnxPolicy
 from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.runs import checkpoint

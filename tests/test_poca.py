@@ -7,9 +7,9 @@ import torch
 from torch import nn
 
 from mappo_unity.config.schema import Activation, ModelConfig
-from mappo_unity.learning.distributions import ActionLayout
-from mappo_unity.learning.encoders import ObsLayout
-from mappo_unity.learning.poca import PocaCritic, flat_actions
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
+from mappo_unity.learning.networks.poca import PocaCritic, flat_actions
 
 CONTINUOUS = ActionLayout(2, ())
 DISCRETE = ActionLayout(0, (3, 2))

@@ -16,11 +16,12 @@ from mappo_unity.config.schema import (
     ValueLoss,
     ValueNormKind,
 )
-from mappo_unity.learning.actor_critic import make_actor, make_critic
-from mappo_unity.learning.distributions import ActionLayout
-from mappo_unity.learning.encoders import ObsLayout
 from mappo_unity.learning.loss import ACTOR_LEARNS
+from mappo_unity.learning.networks.actor_critic import make_actor, make_critic
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.ppo import PolicyLearner
+from mappo_unity.learning.value_norm import move_statistics
 
 T, G, A, OBS = 12, 5, 2, 3
 TWO_CONTINUOUS = ActionLayout(2, ())
@@ -186,9 +187,9 @@ def test_popart_moves_the_statistics_and_leaves_the_values(kind, hidden, share):
     learner = make_learner(model=model, normalize_values=ValueNormKind.popart)
     assert len(learner.value_layers) == (1 if share else A)
     batch = make_batch(learner)
-    learner._move_value_norm(torch.randn(100) * 5 + 30)
+    move_statistics(learner.value_norm, torch.randn(100) * 5 + 30, learner.value_layers)
     before = learner.reader.values_of(batch)
-    learner._move_value_norm(torch.randn(100) * 50 - 300)
+    move_statistics(learner.value_norm, torch.randn(100) * 50 - 300, learner.value_layers)
     after = learner.reader.values_of(batch)
     assert learner.value_norm.statistics()[0] < -100
     assert torch.allclose(before, after, rtol=1e-4, atol=1e-2)

@@ -12,9 +12,9 @@ from mappo_unity.config.schema import Config, CriticKind, ModelConfig
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.critics import CentralCritic, PooledCritic
-from mappo_unity.learning.distributions import ActionDistribution, ActionLayout
-from mappo_unity.learning.encoders import Encoder, ObsLayout
+from mappo_unity.learning.networks.critics import CentralCritic, PooledCritic
+from mappo_unity.learning.networks.distributions import ActionDistribution, ActionLayout
+from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
 from mappo_unity.scenes import make_scene
 
 

@@ -15,11 +15,11 @@ from torchrl.objectives import ClipPPOLoss
 
 from mappo_unity import keys
 from mappo_unity.config.schema import EntropyKind, PPOConfig, RatioKind, ValueLoss
-from mappo_unity.learning.actor_critic import UnityActor
 from mappo_unity.learning.advantage import masked_mean
-from mappo_unity.learning.distributions import ActionDistribution
-from mappo_unity.learning.poca import PocaCritic
-from mappo_unity.learning.recurrent import RecurrentCritic
+from mappo_unity.learning.networks.actor_critic import UnityActor
+from mappo_unity.learning.networks.distributions import ActionDistribution
+from mappo_unity.learning.networks.poca import PocaCritic
+from mappo_unity.learning.networks.recurrent import RecurrentCritic
 
 ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: the slot acted and the outcome is known
 CRITIC_LEARNS = "critic_learns"  # bool [rows, A, 1]: the same, or its agent departed while a team mate acted
@@ -33,7 +33,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
     """ClipPPOLoss over the slots that acted.
 
     Args:
-        actor, critic: see `learning.actor_critic`.
+        actor, critic: see `learning.networks.actor_critic`.
         cfg: the learner's options.
 
     Attributes: `log_ratio` ``[..., n]`` and `entropy` ``[...]`` of the last call, without gradients.

@@ -12,12 +12,11 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from mappo_unity import keys
-from mappo_unity.config.schema import Optimizer, PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
-from mappo_unity.learning.actor_critic import Actor, UnityActor
+from mappo_unity.config.schema import PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
 from mappo_unity.learning.advantage import (
     Advantage,
     estimate,
@@ -27,14 +26,15 @@ from mappo_unity.learning.advantage import (
     normalize,
     scheduled,
 )
-from mappo_unity.learning.carried import VALUED, CarriedRounds
-from mappo_unity.learning.encoders import RunningNorm
+from mappo_unity.learning.carried import VALUED, CarriedRounds, has_value
 from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS, MaskedClipPPOLoss
 from mappo_unity.learning.minibatches import make_buffer
-from mappo_unity.learning.poca import PocaCritic
-from mappo_unity.learning.recurrent import RecurrentCritic
+from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
+from mappo_unity.learning.networks.encoders import RunningNorm
+from mappo_unity.learning.networks.poca import PocaCritic
+from mappo_unity.learning.optimizer import clip_gradients, in_two_groups, make_optimizer
 from mappo_unity.learning.rows import SequenceRows, TeamRows
-from mappo_unity.learning.value_norm import ValueNorm
+from mappo_unity.learning.value_norm import ValueNorm, move_statistics
 from mappo_unity.learning.value_reader import ValueReader, Values
 
 
@@ -42,7 +42,7 @@ class PolicyLearner:
     """Everything that learns for one policy name.
 
     Args:
-        actor, critic: see `learning.actor_critic`; both have a memory, or neither.
+        actor, critic: see `learning.networks.actor_critic`; both have a memory, or neither.
         cfg: the learner's options.
     """
 
@@ -65,8 +65,7 @@ class PolicyLearner:
             else (TeamRows(self.row_keys))
         )
 
-        # the layers that give values, which PopArt rescales
-        self.value_layers = value_layers(critic)
+        self.value_layers = value_layers(critic)  # which PopArt rescales
         self.has_baseline = any(isinstance(m, PocaCritic) for m in critic.modules())
         self.bounded = [m for m in actor.modules() if isinstance(m, Actor)]
         self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
@@ -112,8 +111,7 @@ class PolicyLearner:
         values = self.reader.read(rounds, following)
 
         ended = rounds.get(keys.TERMINATED) | rounds.get(keys.TRUNCATED)
-        # an end cuts the way to the row after the last
-        view = make_view(rounds.get(VALUED), following.get(keys.ACTING)[-1] | _departed(following), ended)
+        view = make_view(rounds.get(VALUED), has_value(following[-1]), ended)
         gae = estimate(
             view,
             self._rewards(rounds),
@@ -148,7 +146,11 @@ class PolicyLearner:
         # values were denormalised, and are normalised below: the statistics move in between
         by_minibatch = self.cfg.value_norm_update is ValueNormUpdate.minibatch
         if not by_minibatch:
-            self._move_value_norm(gae.target[gae.known])
+            move_statistics(
+                self.value_norm,
+                gae.target[gae.known],
+                self.value_layers if self.cfg.normalize_values is ValueNormKind.popart else (),
+            )
 
         advantage = gae.advantage
         if values.baseline is not None:
@@ -167,23 +169,6 @@ class PolicyLearner:
             rounds.set(name, state)
         rounds.set(ACTOR_LEARNS, learns)
         rounds.set(CRITIC_LEARNS, gae.known)
-
-    @torch.no_grad()
-    def _move_value_norm(self, returns: Tensor) -> None:
-        """Take returns into the statistics; with PopArt the critic's values stay what they were.
-
-        PopArt (van Hasselt et al., arXiv 1602.07714, eq. 7): w' = w std / std',
-        b' = (std b + mean - mean') / std'.
-        """
-        mean, std = self.value_norm.statistics()
-        self.value_norm.update(returns)
-        if self.cfg.normalize_values is not ValueNormKind.popart:
-            return
-
-        new_mean, new_std = self.value_norm.statistics()
-        for layer in self.value_layers:
-            layer.weight.mul_(std / new_std)
-            layer.bias.mul_(std).add_(mean - new_mean).div_(new_std)
 
     def update(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Run the epochs; take everything back if a number is not finite or the KL explodes."""
@@ -235,7 +220,7 @@ class PolicyLearner:
 
         self.optimizer.zero_grad()
         total.backward()
-        grad_norm = self._clip_gradients()
+        grad_norm = clip_gradients(self.optimizer, self.cfg)
         self.optimizer.step()
         for net in self.bounded:
             net.project()
@@ -263,17 +248,6 @@ class PolicyLearner:
         """Return the approximate KL on the last minibatch, now that its step is taken."""
         self.loss.compare(minibatch)
         return self._kl(minibatch.get(ACTOR_LEARNS))
-
-    def _clip_gradients(self) -> Tensor:
-        limit = math.inf if self.cfg.max_grad_norm is None else self.cfg.max_grad_norm
-        if not self.cfg.separate_optimizers:
-            return nn.utils.clip_grad_norm_(self.params, limit, foreach=True)
-
-        norms = [
-            nn.utils.clip_grad_norm_(group["params"], limit, foreach=True)
-            for group in self.optimizer.param_groups
-        ]
-        return torch.stack(norms).norm()
 
     @torch.no_grad()
     def _normalize_values(self, minibatch: TensorDictBase) -> None:
@@ -324,39 +298,3 @@ class PolicyLearner:
         self.reader.load_state_dict(state.get("critic_states", {}))
         self.rollbacks = int(state["rollbacks"])
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2
-
-
-def value_layers(critic: TensorDictModule) -> list[nn.Linear]:
-    """Return the layers of a critic whose output is the value."""
-    net = critic.module
-    if isinstance(net, RecurrentCritic):
-        return net.value_heads
-    return [member.head for member in getattr(net, "nets", [net])]
-
-
-def _departed(following: TensorDictBase) -> Tensor:
-    """Return who departed, of the row after the last, where a team mate acts."""
-    last = following[-1]
-    return last.get(keys.DEPARTED) & last.get(keys.ACTING).any(-2, keepdim=True)
-
-
-def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch.optim.Optimizer:
-    """Build the optimizer, with a group for the actor and one for the critic.
-
-    Its fused form makes one pass over all parameters.
-    """
-    kind = torch.optim.AdamW if cfg.optimizer is Optimizer.adamw else torch.optim.Adam
-    groups = [{"params": list(net.parameters())} for net in (actor, critic)]
-    return kind(groups, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=1e-5, fused=True)
-
-
-def in_two_groups(state: dict[str, Any], actor_size: int) -> dict[str, Any]:
-    """Return an optimizer's state with the actor's parameters in one group and the critic's in another.
-
-    Before 0.3 there was one group for all, the actor's first.
-    """
-    if len(state["param_groups"]) != 1:
-        return state
-    (group,) = state["param_groups"]
-    parts = group["params"][:actor_size], group["params"][actor_size:]
-    return state | {"param_groups": [group | {"params": list(part)} for part in parts]}

@@ -10,7 +10,7 @@ from mappo_unity import keys
 from mappo_unity.config.schema import PPOConfig
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS, MEMBER, TEAM
-from mappo_unity.learning.recurrent import RecurrentCritic
+from mappo_unity.learning.networks.recurrent import RecurrentCritic
 from mappo_unity.learning.sequences import cut_sequences
 
 _LEARNT = (ACTOR_LEARNS, CRITIC_LEARNS, keys.ADVANTAGE, keys.VALUE_TARGET, keys.VALUE, BASELINE)

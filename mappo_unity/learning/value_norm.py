@@ -7,6 +7,8 @@ instead, which leaves the critic's output in the reward's scale; hence this modu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -61,3 +63,18 @@ class ValueNorm(nn.Module):
         """Return ``values * std + mean``, the critic's output in the reward's scale."""
         mean, std = self.statistics()
         return values * std + mean
+
+
+@torch.no_grad()
+def move_statistics(norm: ValueNorm, returns: Tensor, layers: Sequence[nn.Linear] = ()) -> None:
+    """Take returns ``[n]`` into the statistics; what these layers say, in the reward's scale, stays.
+
+    PopArt (van Hasselt et al., arXiv 1602.07714, eq. 7): w' = w std / std',
+    b' = (std b + mean - mean') / std'.
+    """
+    mean, std = norm.statistics()
+    norm.update(returns)
+    new_mean, new_std = norm.statistics()
+    for layer in layers:
+        layer.weight.mul_(std / new_std)
+        layer.bias.mul_(std).add_(mean - new_mean).div_(new_std)

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from mappo_unity import keys
 from mappo_unity.learning.carried import VALUED
-from mappo_unity.learning.poca import PocaCritic
-from mappo_unity.learning.recurrent import BASELINE_STATE, VALUE_STATE, RecurrentCritic
+from mappo_unity.learning.networks.poca import PocaCritic
+from mappo_unity.learning.networks.recurrent import BASELINE_STATE, VALUE_STATE, RecurrentCritic
 from mappo_unity.learning.value_norm import ValueNorm
 
 
@@ -34,7 +34,7 @@ class ValueReader:
     """Ask a critic about batches.
 
     Args:
-        critic: see `learning.actor_critic.make_critic`.
+        critic: see `learning.networks.actor_critic.make_critic`.
         norm: turns its output into the reward's scale.
     """
 

@@ -12,8 +12,8 @@ import numpy as np
 from torch import Tensor, nn
 
 from mappo_unity.config.schema import LOG_STD_RANGE
-from mappo_unity.learning.actor_critic import Actor
-from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout, scale_shift
+from mappo_unity.learning.networks.actor_critic import Actor
+from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout, scale_shift
 
 if TYPE_CHECKING:
     from mappo_unity.policies.onnx_graph import Graph

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from mappo_unity import keys
 from mappo_unity.config.packages import ExportError
-from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionDistribution
+from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionDistribution
 from mappo_unity.policies.onnx_policy import fit_image, open_session
 
 TOLERANCE = 1e-5  # of deterministic actions, and of the log-probability of the branch taken

@@ -24,9 +24,9 @@ from torch import Tensor, nn
 from mappo_unity import __version__
 from mappo_unity.config.option_table import with_article
 from mappo_unity.config.packages import PER_MEMBER, ExportError, import_package
-from mappo_unity.learning.actor_critic import Actor, PerMember
-from mappo_unity.learning.encoders import OBS_CLIP, Encoder
-from mappo_unity.learning.recurrent import RecurrentActor
+from mappo_unity.learning.networks.actor_critic import Actor, PerMember
+from mappo_unity.learning.networks.encoders import OBS_CLIP, Encoder
+from mappo_unity.learning.networks.recurrent import RecurrentActor
 from mappo_unity.policies.onnx_actions import BATCH, add_actions
 from mappo_unity.policies.onnx_memory import add_memory
 

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mappo_unity.learning.recurrent import Memory
+from mappo_unity.learning.networks.recurrent import Memory
 
 TO_END = 2**63 - 1  # the end of a slice that goes as far as there is anything
 

@@ -15,9 +15,9 @@ from tensordict import TensorDict
 
 from mappo_unity import keys
 from mappo_unity.config.schema import ModelConfig, bounded_log_std
-from mappo_unity.learning.actor_critic import PerMember, make_actor
-from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
-from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.learning.networks.actor_critic import PerMember, make_actor
+from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.policies.layouts import CHANNELS, check_layout
 from mappo_unity.policies.members import MemberTable, Places, team_places
 from mappo_unity.runs import checkpoint

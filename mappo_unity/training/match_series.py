@@ -17,7 +17,7 @@ import torch
 from mappo_unity.config.schema import Config
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.actor_critic import UnityActor
+from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.policies.layouts import sides_of
 from mappo_unity.policies.matches import Score, play_matches, wilson
 from mappo_unity.policies.policy import ActorPolicy, RandomPolicy

@@ -23,9 +23,9 @@ from mappo_unity.envs.backends import make_env_function
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.actor_critic import JointPolicy, make_actor, make_critic
-from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
-from mappo_unity.learning.encoders import ObsLayout
+from mappo_unity.learning.networks.actor_critic import JointPolicy, make_actor, make_critic
+from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.logger import check_loggers

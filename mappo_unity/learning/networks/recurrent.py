@@ -14,8 +14,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from mappo_unity.config.schema import MemoryKind, ModelConfig
-from mappo_unity.learning.mlp import linear
-from mappo_unity.learning.poca import PocaCritic
+from mappo_unity.learning.networks.mlp import linear
+from mappo_unity.learning.networks.poca import PocaCritic
 
 VALUE_STATE, BASELINE_STATE = "value_state", "baseline_state"
 """Entries of the critic's states, float32 [..., M]: a POCA critic's baseline remembers for itself."""
@@ -90,7 +90,7 @@ class RecurrentActor(nn.Module):
     """An actor whose hidden layers are followed by a memory.
 
     Args:
-        actor: `learning.actor_critic.Actor`; its last layer is replaced.
+        actor: `learning.networks.actor_critic.Actor`; its last layer is replaced.
         cfg: kind and size of the memory.
     """
 
@@ -124,7 +124,7 @@ class RecurrentCritic(nn.Module):
     """A critic with a memory for each member.
 
     Args:
-        critic: any of `learning.critics`, or a `PocaCritic` built for outputs of the memory's width.
+        critic: any of `learning.networks.critics`, or a `PocaCritic` built for outputs of the memory's width.
         cfg: kind and size of the memory.
         sees_team: whether its inputs are those of the whole team.
     """

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from mappo_unity.config.schema import Activation, ModelConfig, WeightInit
-from mappo_unity.learning.encoders import Encoder, ImageEncoder, RunningNorm
+from mappo_unity.learning.networks.encoders import Encoder, ImageEncoder, RunningNorm
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {
     Activation.tanh: nn.Tanh,

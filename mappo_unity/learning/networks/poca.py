@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from torch.nn.functional import layer_norm, one_hot
 
 from mappo_unity.config.schema import ModelConfig
-from mappo_unity.learning.critics import seen_features
-from mappo_unity.learning.distributions import ActionLayout
-from mappo_unity.learning.encoders import Encoder, ObsLayout
-from mappo_unity.learning.mlp import ACTIVATIONS
+from mappo_unity.learning.networks.critics import seen_features
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
+from mappo_unity.learning.networks.mlp import ACTIVATIONS
 
 HEADS = 4
 ABSENT = -1e6  # score of an entity that is not there; finite, so that a team of nobody gives numbers

@@ -19,12 +19,12 @@ from torchrl.modules import ProbabilisticActor
 
 from mappo_unity import keys
 from mappo_unity.config.schema import LOG_STD_RANGE, CriticKind, DistributionKind, MemoryKind, ModelConfig
-from mappo_unity.learning.critics import CentralCritic, LocalCritic, PooledCritic
-from mappo_unity.learning.distributions import ActionDistribution, ActionLayout, state_log_std
-from mappo_unity.learning.encoders import Encoder, ObsLayout
-from mappo_unity.learning.mlp import apply_options, init_head, make_mlp
-from mappo_unity.learning.poca import PocaCritic
-from mappo_unity.learning.recurrent import RecurrentActor, RecurrentCritic, output_size
+from mappo_unity.learning.networks.critics import CentralCritic, LocalCritic, PooledCritic
+from mappo_unity.learning.networks.distributions import ActionDistribution, ActionLayout, state_log_std
+from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
+from mappo_unity.learning.networks.mlp import apply_options, init_head, make_mlp
+from mappo_unity.learning.networks.poca import PocaCritic
+from mappo_unity.learning.networks.recurrent import RecurrentActor, RecurrentCritic, output_size
 
 
 class Actor(nn.Module):
@@ -223,6 +223,14 @@ def _critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: ActionLayo
     else:
         net = PocaCritic(obs, layout, team_size, cfg, head_size=output_size(cfg))
     return apply_options(net, cfg)
+
+
+def value_layers(critic: TensorDictModule) -> list[nn.Linear]:
+    """Return the layers of a critic whose output is the value."""
+    net = critic.module
+    if isinstance(net, RecurrentCritic):
+        return net.value_heads
+    return [member.head for member in getattr(net, "nets", [net])]
 
 
 class JointPolicy(TensorDictModuleBase):

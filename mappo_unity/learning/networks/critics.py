@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from mappo_unity.config.schema import CriticKind, ModelConfig
-from mappo_unity.learning.encoders import Encoder, ObsLayout
-from mappo_unity.learning.mlp import ACTIVATIONS, linear, make_mlp
+from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
+from mappo_unity.learning.networks.mlp import ACTIVATIONS, linear, make_mlp
 
 ATTENTION_HEADS = 4
 CRITIC_GAIN = 0.01  # first values near 0: whatever the scale of returns, they are no noise to be unlearned

@@ -1,0 +1,1 @@
+"""Networks: observations of agents in, actions and values out."""
