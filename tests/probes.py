@@ -329,11 +329,67 @@ class RealEnd(TimeLimit):
     interrupted = False
 
 
+class Recall(Probe):
+    """A sign is seen at first and chosen at the end, `length` decisions later: only a memory knows it.
+
+    Observations: the sign (0 but at first), and whether the answer is due.
+    """
+
+    obs_size, length, every = 2, 10, 1
+
+    def begin(self, teams):
+        self.sign = np.where(teams, self.rng.choice([-1.0, 1.0], self.teams), getattr(self, "sign", 1.0))
+
+    def observe(self):
+        out = np.zeros((self.teams, self.members, 2))
+        out[:, :, 0] = np.where(self.clock < self.every, self.sign, 0.0)[:, None]
+        out[:, :, 1] = (self.clock >= self.length * self.every)[:, None]
+        return out
+
+    def asked(self):
+        return np.repeat((self.clock % self.every == 0)[:, None], self.members, 1)
+
+    def earn(self, choice):
+        due = self.clock == self.length * self.every
+        return np.where(due[:, None], choice * self.sign[:, None], 0.0), np.zeros(self.teams)
+
+    def ends(self):
+        return self.clock > self.length * self.every, np.zeros(self.teams, bool)
+
+
+class LongRecall(Recall):
+    """The same over sixty decisions."""
+
+    length = 60
+
+
+class StaggeredRecall(Recall):
+    """The same for an agent that is asked every third round."""
+
+    every = 3
+
+
+class TeamRecall(Recall):
+    """A team of two: the first sees the sign, both remember what they see, the first answers for both."""
+
+    members = 2
+
+    def observe(self):
+        out = super().observe()
+        out[:, 1, 0] = 0.0
+        return out
+
+    def earn(self, choice):
+        due = self.clock == self.length * self.every
+        return np.zeros((self.teams, 2)), np.where(due, choice[:, 0] * self.sign, 0.0)
+
+
 PROBES = {
     cls.__name__: cls
     for cls in (
         *(Constant, ObsReward, Delayed, ActionReward, ObsActionReward),
         *(Credit, MateKnows, EarlyDeath, Staggered, NewIds, TimeLimit, RealEnd),
+        *(Recall, LongRecall, StaggeredRecall, TeamRecall),
     )
 }
 

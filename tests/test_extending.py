@@ -131,7 +131,7 @@ ROWS = (3, 2)
 class RowsEncoder(nn.Module):
     """Rows ``[..., N, F]`` through one linear layer; of each feature the largest counts."""
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
+    def __init__(self, shape: tuple[int, ...], channel_dim: int) -> None:
         super().__init__()
         self.out = nn.Linear(shape[1], encoders.IMAGE_FEATURES)
 
@@ -173,7 +173,7 @@ def test_an_encoder_for_a_new_shape_trains(
     rows_module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     layout = encoders.ObsLayout(2, (("obs_1", ROWS),))
-    monkeypatch.setattr(encoders.ObsLayout, "from_shapes", classmethod(lambda cls, shapes: layout))
+    monkeypatch.setattr(encoders.ObsLayout, "from_shapes", classmethod(lambda cls, *args: layout))
     monkeypatch.setattr(encoders, "ImageEncoder", RowsEncoder)
     assert encoders.Encoder(layout, True)(torch.zeros(5, 2), torch.zeros(5, *ROWS)).shape == (5, 130)
 

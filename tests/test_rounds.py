@@ -1,12 +1,15 @@
 """What the rows of a round say of episodes: first decisions, ends, team mates that departed, moves."""
 
+import numpy as np
 import pytest
 import torch
 from fakes import Record as R
 from fakes import ScriptedEnv, behavior_spec
 
+from mappo_unity.envs.slots import SlotTable
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.errors import ConfigError
 from mappo_unity.learning.advantage import masked_gae
 from mappo_unity.learning.critics import seen_features
 from mappo_unity.learning.ppo import has_value
@@ -343,3 +346,150 @@ def test_a_snapshot_knows_what_was_paid_and_an_older_one_begins_with_nothing():
 def test_without_death_masking_no_snapshot_holds_group_rewards():
     env = open_env([[one(0), one(1)]], death_masking=False)
     assert "seen" not in env.behaviors["Fake?team=0"].get_state()
+
+
+# --- agents that change their group
+
+
+def returns(env):
+    """Return of every finished episode its agent, its two returns, its length and whether it was cut off."""
+    return [tuple(episode)[:5] for episode in env.pop_episodes()["Fake?team=0"]]
+
+
+def test_an_agent_that_changes_its_group_goes_on_in_its_new_team():
+    env = open_env(
+        [
+            [one(0, obs=1), one(1, obs=2), two(2, obs=3)],
+            # the same agents in the same order
+            [two(0, obs=5, reward=2, group_reward=3), one(1, obs=6), two(2, obs=7)],
+            [two(0, obs=8, reward=1), one(1), two(2)],
+            [two(0, obs=9, reward=0.5, ends=CUT), one(1), two(2, ends=CUT)],
+        ]
+    )
+    rows = play(env, 3)
+    assert read(rows, "acting")[:2] == [[True, True, True, False], [False, True, True, True]]
+    assert read(rows, "next", "truncated")[:2] == [[True, False, False, False], [False] * 4]
+    assert not rows["next", "Fake", "terminated"].any()
+    assert read(rows, "next", "reward") == [[2, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0.5]]
+    assert read(rows, "next", "group_reward")[0] == [3, 0, 0, 0]
+
+    # the old row ends with what the agent saw as it moved
+    assert read(rows, "next", "obs_0")[0] == [5, 6, 7, 5]
+    assert read(rows, "next", "obs_0")[1][1:] == [0, 0, 8]
+    assert read(rows, "next", "present")[0] == [True, True, True, True]
+    assert read(rows, "present")[1] == [False, True, True, True]
+    assert read(rows, "is_init")[1:] == [[False, False, False, True], [False] * 4]
+
+    # it is one episode all the same
+    assert returns(env) == [(0, 3.5, 3.0, 3, True), (2, 0.0, 0.0, 3, True)]
+
+
+def test_full_teams_exchange_members():
+    env = open_env(
+        [
+            [one(0, obs=1), one(1, obs=2), two(2, obs=3), two(3, obs=4)],
+            [two(0, obs=5, reward=1), one(1, obs=6), one(2, obs=7, reward=2), two(3, obs=8)],
+            [one(2, reward=3, ends=END), two(0, reward=4, ends=END), one(1, ends=END), two(3, ends=END)],
+            [R(9, group=3)],
+        ]
+    )
+    rows = play(env, 2)
+    assert read(rows, "next", "truncated")[0] == [True, False, True, False]
+    assert read(rows, "next", "obs_0")[0] == [5, 6, 7, 8]
+    assert read(rows, "next", "reward") == [[1, 0, 2, 0], [3, 0, 4, 0]]
+    assert read(rows, "obs_0")[1] == [7, 6, 5, 8]
+    assert read(rows, "is_init")[1] == [True, False, True, False]
+    assert rows["Fake", "present"].all()
+    assert [row[:4] for row in returns(env)[:2]] == [(2, 5.0, 0.0, 2), (0, 5.0, 0.0, 2)]
+
+
+def test_an_agent_that_ended_and_begins_in_another_group_is_placed_anew():
+    env = open_env(
+        [
+            [one(0, obs=1), one(1), two(2)],
+            [one(1), two(2), one(0, obs=9, reward=1, ends=CUT), two(0, obs=2, reward=7)],
+            [two(0, obs=3), one(1), two(2)],
+        ]
+    )
+    rows = play(env, 2)
+    assert read(rows, "next", "truncated") == [[True, False, False, False], [False] * 4]
+    assert read(rows, "next", "obs_0")[0][0] == 9
+    assert read(rows, "next", "reward") == [[1, 0, 0, 0], [0] * 4]
+    assert read(rows, "is_init")[1] == [False, False, False, True]
+    assert returns(env) == [(0, 1.0, 0.0, 1, True)]
+
+
+def test_a_departed_member_s_slot_earns_on_though_its_agent_begins_in_another_group():
+    env = open_env(
+        [
+            [one(0), one(1), two(2)],
+            [one(0, ends=END), two(0), one(1), two(2)],
+            [two(0, group_reward=9), one(1, group_reward=1), two(2, group_reward=9)],
+            [two(0), one(1, group_reward=2, ends=END), two(2)],
+        ]
+    )
+    rows = play(env, 3)
+    assert [row[0] for row in read(rows, "next", "group_reward")] == [0, 1, 2]
+    assert [row[0] for row in read(rows, "next", "terminated")] == [False, False, True]
+    assert [row[3] for row in read(rows, "is_init")] == [False, True, False]
+
+
+def test_departed_members_end_with_the_last_of_their_team_that_moves_away():
+    env = open_env(
+        [
+            [one(0), one(1), two(2)],
+            [one(0, ends=END), one(1), two(2)],
+            [two(1, group_reward=2), two(2, group_reward=1)],
+            [two(2, ends=END, group_reward=4), R(9, group=3)],
+            [two(1, group_reward=4.5)],
+        ],
+        max_teams=3,
+    )
+    rows = play(env, 4)
+    assert [row[:2] for row in read(rows, "next", "truncated")] == [
+        [False] * 2,
+        [True] * 2,
+        [False] * 2,
+        [False] * 2,
+    ]
+    assert [row[0] for row in read(rows, "next", "group_reward")] == [0, 2, 0, 0]
+    assert read(rows, "next", "departed")[1] == [True, *[False] * 5]
+    assert not rows["Fake", "present"][2, 0].any()
+    # in its new team it has seen what this has earned when it came, 1, and nothing of its old team's
+    assert [row[2] for row in read(rows, "next", "group_reward")] == [0, 1, 4, 0.5]
+
+
+def test_an_agent_that_leaves_its_group_is_alone_and_more_than_there_is_room_for_is_an_error():
+    script = [[one(0), one(1)], [one(0), R(1)], [one(0), R(1, reward=1)]]
+    rows = play(open_env(script, max_teams=2), 2)
+    assert read(rows, "acting")[1] == [True, False, True, False]
+    assert read(rows, "next", "reward")[1] == [0, 0, 1, 0]
+    with pytest.raises(ConfigError, match=r"agent 1.*env\.max_teams=2"):
+        play(open_env(script), 2)
+    with pytest.raises(ConfigError, match=r"agent 1.*group 1.*env\.max_team_size=2"):
+        play(open_env([[R(0), R(1)], [one(0), one(1)]]), 1)
+
+
+def test_a_snapshot_after_a_move_goes_on():
+    script = [
+        [one(0), one(1), two(2)],
+        [two(0, reward=1), one(1), two(2)],
+        [one(1), two(2), two(0, reward=2, ends=END)],
+        [one(5), two(0), one(1), two(2)],
+    ]
+    env = UnityEnv(lambda seed: Snapshots(script))
+    play(env, 1)
+    other = UnityEnv(lambda seed: Snapshots(script))
+    other.set_state(env.get_state())
+    rows = play(other, 2)
+    assert read(rows, "next", "reward") == [[0, 0, 0, 2], [0] * 4]
+    assert returns(other) == [(0, 3.0, 0.0, 2, False)]
+    assert read(other.root().unsqueeze(0), "acting") == [[True] * 4]
+
+
+def test_a_new_agent_leaves_the_slot_of_one_that_begins_anew_with_it():
+    table = SlotTable("Fake", num_teams=1, team_size=2)
+    groups = np.ones(2, np.int32)
+    table.assign(np.array([0, 1], np.int32), groups)
+    table.ended[:] = True
+    assert table.assign(np.array([7, 0], np.int32), groups).tolist() == [1, 0]

@@ -34,6 +34,14 @@ class Returns:
         self.individual_return[slots] += reward
         self.group_return[slots] += group_reward
 
+    def move(self, old: np.ndarray, new: np.ndarray) -> None:
+        """Let the episodes of some slots go on in others."""
+        for name in self.ARRAYS:
+            values = getattr(self, name)
+            moved = values[old]  # a copy: teams may exchange members
+            values[old] = 0
+            values[new] = moved
+
     def finish(self, rows: np.ndarray, agents: list[int], interrupted: np.ndarray, drop: np.ndarray) -> None:
         """End the episodes of slots ``[n]``; those in `drop`, bool ``[N]``, are not reported."""
         for agent, slot, cut in zip(agents, rows.tolist(), interrupted.tolist()):

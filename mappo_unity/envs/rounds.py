@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps
+from mlagents_envs.base_env import BehaviorSpec, DecisionSteps, TerminalSteps
 
 from mappo_unity.envs.ends import RoundEnds
 from mappo_unity.envs.group_rewards import GroupRewards
@@ -110,26 +110,6 @@ class BehaviorState:
             self.group_rewards.forget()
         self.begin_round()
 
-    def actions(self, action: np.ndarray, limit: float) -> ActionTuple:
-        """Return the actions of the agents that requested a decision, in the order of their requests.
-
-        Args:
-            action: ``[N, C + K]``: continuous columns first, then branch indices.
-            limit: continuous columns are clipped to +-limit and divided by it.
-        """
-        rows = action[self.order]
-        size = self.spec.action_spec.continuous_size
-        out = ActionTuple()
-
-        if size:
-            clipped = np.minimum(np.maximum(rows[:, :size], -limit), limit)
-            out.add_continuous(clipped.astype(np.float32, copy=False) / np.float32(limit))
-
-        if self.spec.action_spec.discrete_size:
-            out.add_discrete(rows[:, size:].astype(np.int32))
-
-        return out
-
     def _add_terminal(self, terminal: TerminalSteps) -> None:
         slots = self.slots.lookup(terminal.agent_id)
         own = slots >= 0
@@ -177,12 +157,18 @@ class BehaviorState:
 
     def _add_decision(self, decision: DecisionSteps) -> None:
         slots = self.slots.assign(decision.agent_id, decision.group_id)
+        group_rewards = decision.group_reward
+        if moved := len(self.slots.movers):
+            self._move(slots, decision)
+            # what movers bring was earned in the teams that they left
+            group_rewards = group_rewards.copy()
+            group_rewards[self.slots.movers] = 0
 
         self.returns.add(slots, decision.reward, decision.group_reward)
         self.returns.length[slots] += 1
 
         goes_on = self.present[slots] & ~self.departed[slots]
-        self._share_group_reward(slots, decision.group_reward, goes_on)
+        self._share_group_reward(slots, group_rewards, goes_on)
         if np.count_nonzero(goes_on) == len(goes_on):
             earners, reward, group_reward = slots, decision.reward, decision.group_reward
         else:  # what a first decision brings was earned by no action
@@ -205,7 +191,28 @@ class BehaviorState:
 
         self.acting[slots] = True
         self.first[slots] = self.returns.length[slots] == 1
+        if moved:
+            self.first[slots[self.slots.movers]] = True
         self.order = slots
+
+    def _move(self, slots: np.ndarray, decision: DecisionSteps) -> None:
+        """Cut off the rows of agents that changed their group; their episodes go on in new slots."""
+        movers, left = self.slots.movers, self.slots.left
+        group_reward = decision.group_reward[movers]
+        self.reward[left] += decision.reward[movers]
+        self.group_reward[left] += group_reward
+        self.returns.move(left, slots[movers])
+
+        self.truncated[left] = True
+        self._ends.playing(left, [o[movers] for o in decision.obs])
+        self.present[left] = False
+
+        alone = ~self._team_plays_on(left)
+        if self.slots.team_size > 1 and np.count_nonzero(alone):
+            everyone = np.ones(np.count_nonzero(alone), bool)
+            # nobody else is left to tell the departed what they earned
+            self._share_group_reward(left[alone], group_reward[alone], everyone)
+            self._end_teams(left[alone], interrupted=everyone)
 
     def _team_plays_on(self, rows: np.ndarray) -> np.ndarray:
         size = self.slots.team_size

@@ -2,7 +2,7 @@
 
 Slots are flat numbers ``team * A + member``. Agents of one group share a team; an agent without a group is a
 team of its own. A slot belongs to its agent until the agent has ended *and* somebody else needs the place, so
-an agent that begins its next episode under its old id keeps its slot.
+an agent that begins its next episode under its old id keeps its slot; or until the agent changes its group.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 from mappo_unity.errors import ConfigError
 
 FREE = -(2**62)  # no agent id, no team key
+NOBODY = np.zeros(0, np.int64)
 
 
 class SlotTable:
@@ -26,11 +27,14 @@ class SlotTable:
         self._slot_of: dict[int, int] = {}
 
         # mostly the same agents request decisions in the same order again: these skip the look-ups
-        self._last_ids = np.zeros(0, np.int64)
-        self._last_slots = np.zeros(0, np.int64)
+        self._last_ids = self._last_groups = self._last_slots = NOBODY
+
+        self.movers = self.left = NOBODY  # of the last `assign`: places in it, and slots that these left
 
     def assign(self, agent_ids: np.ndarray, group_ids: np.ndarray) -> np.ndarray:
-        """Return the slots of these agents, giving places to the new ones.
+        """Return the slots of these agents, giving places to those that are new or have changed their group.
+
+        `movers` says which of them changed it during an episode, `left` which slots these had before.
 
         Args:
             agent_ids: int ``[n]``; group_ids: int ``[n]``, 0 = alone.
@@ -41,15 +45,26 @@ class SlotTable:
         Raises:
             ConfigError: no slot is left for a new agent or team.
         """
-        if np.array_equal(agent_ids, self._last_ids):
+        same_agents = np.array_equal(agent_ids, self._last_ids)
+        if same_agents and np.array_equal(group_ids, self._last_groups):
+            if len(self.movers):
+                self.movers = self.left = NOBODY
             return self._last_slots
 
-        slots = np.empty(len(agent_ids), np.int64)
-        for row, (agent, group) in enumerate(zip(agent_ids.tolist(), group_ids.tolist())):
-            slot = self._slot_of.get(agent)
-            slots[row] = self._place(agent, group) if slot is None else slot
+        # an agent without a group is a team by itself; its key is negative, as no group's is
+        keys = np.where(group_ids > 0, group_ids, -1 - agent_ids.astype(np.int64))
+        slots = self.lookup(agent_ids)
+        self._leave_teams(agent_ids, slots, keys)
 
-        self._last_ids, self._last_slots = agent_ids.astype(np.int64), slots
+        new = np.flatnonzero(slots < 0).tolist()
+        if new:
+            # whoever begins its next episode in this result keeps its slot from the new ones
+            self.ended[slots[slots >= 0]] = False
+        for row in new:
+            slots[row] = self._place(int(agent_ids[row]), int(group_ids[row]), int(keys[row]))
+
+        self._last_ids, self._last_groups = agent_ids.astype(np.int64), group_ids.astype(np.int64)
+        self._last_slots = slots
         return slots
 
     def lookup(self, agent_ids: np.ndarray) -> np.ndarray:
@@ -60,9 +75,26 @@ class SlotTable:
         """Return the ids of the agents that hold these slots."""
         return self.agent_id[slots].tolist()
 
-    def _place(self, agent: int, group: int) -> int:
-        # an agent without a group is a team by itself; its key is negative, as no group's is
-        key = group if group > 0 else -1 - agent
+    def _leave_teams(self, agent_ids: np.ndarray, slots: np.ndarray, keys: np.ndarray) -> None:
+        """Take from agents of another team the slots that they hold; in `slots` they hold none then."""
+        away = (slots >= 0) & (self.team_key[slots // self.team_size] != keys)
+        self.movers = np.flatnonzero(away)
+        self.left = slots[self.movers]
+        if not len(self.movers):
+            return
+
+        # all of them before the first finds its place: teams may exchange members
+        slots[self.movers] = -1
+        for agent in agent_ids[self.movers].tolist():
+            del self._slot_of[agent]
+
+        # who has ended begins anew elsewhere, and moves nothing
+        during = ~self.ended[self.left]
+        self.agent_id[self.left] = FREE
+        self.ended[self.left] = True
+        self.movers, self.left = self.movers[during], self.left[during]
+
+    def _place(self, agent: int, group: int, key: int) -> int:
         team = self._team(key, agent)
         members = slice(team * self.team_size, (team + 1) * self.team_size)
 
@@ -85,7 +117,7 @@ class SlotTable:
         self.ended[slot] = False
 
         # the slots of the last ids may have changed hands
-        self._last_ids = np.zeros(0, np.int64)
+        self._last_ids = NOBODY
         return slot
 
     def _team(self, key: int, agent: int) -> int:
@@ -131,7 +163,7 @@ class SlotTable:
 
         # what follows from the arrays is made anew
         self._slot_of = {int(a): s for s, a in enumerate(self.agent_id.tolist()) if a != FREE}
-        self._last_ids = self._last_slots = np.zeros(0, np.int64)
+        self._last_ids = self._last_groups = self._last_slots = NOBODY
 
 
 def count_teams(agent_ids: np.ndarray, group_ids: np.ndarray) -> tuple[int, int]:

@@ -20,6 +20,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from mappo_unity import keys
+from mappo_unity.envs.actions import action_tuple
 from mappo_unity.envs.opening import first_results, team_sizes
 from mappo_unity.envs.rounds import BehaviorState, Episode
 from mappo_unity.envs.slots import SlotTable
@@ -155,8 +156,11 @@ class UnityEnv(EnvBase):
         for name, behavior in self._behaviors.items():
             if len(behavior.order):
                 action = tensordict.get((self.entry_of[name], keys.ACTION)).reshape(len(behavior.acting), -1)
-                self.base_env.set_actions(name, behavior.actions(action.numpy(), self.action_limit))
-            # after `actions`, which reads the order of the requests that this forgets
+                asked = action.numpy()[behavior.order]
+                self.base_env.set_actions(
+                    name, action_tuple(behavior.spec.action_spec, asked, self.action_limit)
+                )
+            # only now, as it forgets the order of the requests
             behavior.begin_round()
 
         self._untouched = False

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from mappo_unity import keys
 from mappo_unity.errors import ConfigError
+from mappo_unity.scenes.contract.images import FIRST, LAST, channel_dim, guessed_channel_dim
 
 OBS_CLIP = 5.0  # ML-Agents clips normalised observations to +-5
 IMAGE_FEATURES = 128
@@ -22,14 +23,25 @@ IMAGE_FEATURES = 128
 
 @dataclass(frozen=True)
 class ObsLayout:
-    """Sizes of an agent's observation: all vectors in one, every image (or grid) by itself."""
+    """Sizes of an agent's observation: all vectors in one, every image (or grid) by itself.
+
+    `channel_dims`: of each image the dimension of its channels, 0 or 2; none given: 0 of all of them.
+    """
 
     vector: int
     images: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    channel_dims: tuple[int, ...] = ()
 
     @classmethod
-    def from_shapes(cls, shapes: Sequence[Sequence[int]]) -> ObsLayout:
+    def from_shapes(
+        cls, shapes: Sequence[Sequence[int]], channel_dims: Sequence[int | None] | None = None
+    ) -> ObsLayout:
         """Read the layout from the sensors' shapes, in their order.
+
+        Args:
+            shapes: of all sensors.
+            channel_dims: for each sensor, as `channel_dim` returns it; None: they are guessed from the
+                shapes, as for older checkpoints, which do not tell.
 
         Raises:
             ConfigError: a sensor is neither a vector nor an image.
@@ -42,12 +54,14 @@ class ObsLayout:
                 )
 
         images = [(keys.SENSOR.format(i), tuple(s)) for i, s in enumerate(shapes) if len(s) == 3]
-        return cls(sum(s[0] for s in shapes if len(s) == 1), tuple(images))
+        dims = [guessed_channel_dim(tuple(s)) for s in shapes] if channel_dims is None else channel_dims
+        vector = sum(s[0] for s in shapes if len(s) == 1)
+        return cls(vector, tuple(images), tuple(dim for dim in dims if dim is not None))
 
     @classmethod
     def from_specs(cls, specs: Sequence[ObservationSpec]) -> ObsLayout:
         """Read the layout from observation specs."""
-        return cls.from_shapes([spec.shape for spec in specs])
+        return cls.from_shapes([spec.shape for spec in specs], [channel_dim(spec) for spec in specs])
 
     @property
     def keys(self) -> list[str]:
@@ -115,7 +129,8 @@ class Encoder(nn.Module):
     def __init__(self, layout: ObsLayout, normalize: bool) -> None:
         super().__init__()
         self.norm: nn.Module = RunningNorm(layout.vector) if normalize and layout.vector else nn.Identity()
-        self.images = nn.ModuleList([ImageEncoder(shape) for _, shape in layout.images])
+        dims = layout.channel_dims or (FIRST,) * len(layout.images)
+        self.images = nn.ModuleList([ImageEncoder(s, dim) for (_, s), dim in zip(layout.images, dims)])
         self.vector, self.has_vector = layout.vector, layout.vector > 0
         self.size = layout.vector + IMAGE_FEATURES * len(layout.images)
 
@@ -132,13 +147,14 @@ class Encoder(nn.Module):
 class ImageEncoder(nn.Module):
     """Two convolutions and a linear layer, as ML-Agents' "simple" encoder; 3x3 ones on small images.
 
-    The smaller of the first and the last dimension is taken for the channels (Unity sends ``C, H, W``
-    since package 3.0 and sent ``H, W, C`` before).
+    Args:
+        shape: of an image.
+        channel_dim: 0 for ``C, H, W`` (Unity since package 3.0), 2 for ``H, W, C`` (before).
     """
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
+    def __init__(self, shape: tuple[int, ...], channel_dim: int = FIRST) -> None:
         super().__init__()
-        self.channels_last = shape[2] < shape[0]
+        self.channels_last = channel_dim == LAST
         channels, height, width = (shape[2], *shape[:2]) if self.channels_last else shape
 
         if min(height, width) >= 20:

@@ -72,13 +72,15 @@ class Memory(nn.Module):
         return torch.cat(state, -1).squeeze(0) if isinstance(state, tuple) else state.squeeze(0)
 
     def _initialize(self) -> None:
-        """Xavier for each gate and a forget bias of 1, as ML-Agents (trainers/torch_entities/layers.py)."""
+        """Xavier for each gate, and at first little is forgotten.
+
+        As ML-Agents (trainers/torch_entities/layers.py): the forget gate's bias is 1 in both bias vectors.
+        """
         for name, parameter in self.layer.named_parameters():
             if "bias" in name:
+                # the second gate of both kinds is the one that keeps: an LSTM's forget, a GRU's update gate
                 nn.init.zeros_(parameter)
-                if self.is_lstm:
-                    # gates lie in the order input, forget, cell, output; both bias vectors count
-                    parameter.data[self.size : 2 * self.size].fill_(1.0)
+                parameter.data[self.size : 2 * self.size].fill_(1.0)
                 continue
             for gate in parameter.data.split(self.size):
                 nn.init.xavier_uniform_(gate)

@@ -11,11 +11,15 @@ from typing import Any
 from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.protobuf import install
+from mappo_unity.scenes.contract.images import FIRST, LAST, channel_dim, guessed_channel_dim
 
 # Before mlagents_envs: its messages do not load on a current protobuf without this.
 install()
 
 from mlagents_envs.base_env import BehaviorSpec  # noqa: E402
+
+CHANNELS = "channel_dims"
+"""The entry of a layout that says where each sensor's channels stand, None for vectors."""
 
 
 def describe_spec(spec: BehaviorSpec, team_size: int) -> dict[str, Any]:
@@ -23,9 +27,38 @@ def describe_spec(spec: BehaviorSpec, team_size: int) -> dict[str, Any]:
     return {
         "team_size": team_size,
         "sensors": [list(o.shape) for o in spec.observation_specs],
+        CHANNELS: [channel_dim(o) for o in spec.observation_specs],
         "continuous": int(spec.action_spec.continuous_size),
         "branches": [int(n) for n in spec.action_spec.discrete_branches],
     }
+
+
+def guessed_otherwise(saved: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
+    """Tell whether an older checkpoint took other dimensions of an image for its channels than they are.
+
+    Args:
+        saved, found: layouts by policy name, of the checkpoint and of the environment.
+    """
+    return any(
+        CHANNELS not in layout
+        and [guessed_channel_dim(s) for s in layout["sensors"]] != found[name][CHANNELS]
+        for name, layout in saved.items()
+    )
+
+
+def without_channels(layout: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the layouts, by policy name, as older versions wrote them."""
+    return {
+        name: {key: value for key, value in policy.items() if key != CHANNELS}
+        for name, policy in layout.items()
+    }
+
+
+def same_layout(saved: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
+    """Tell whether two layouts of a policy are the same; an older one does not tell its channels."""
+    if CHANNELS not in saved:
+        found = without_channels({"": found})[""]
+    return saved == found
 
 
 def check_layout(owner: str, layout: Mapping[str, Any], behavior: str, spec: BehaviorSpec) -> None:
@@ -40,7 +73,7 @@ def check_layout(owner: str, layout: Mapping[str, Any], behavior: str, spec: Beh
         )
 
     found = describe_spec(spec, layout[name]["team_size"])
-    if layout[name] != found:
+    if not same_layout(layout[name], found):
         raise ConfigError(
             f"{owner} cannot play {behavior!r}: it was trained with {_words(layout[name])}, but the "
             f"environment has {_words(found)}"
@@ -73,7 +106,10 @@ def _names(layout: Mapping[str, Any]) -> str:
 
 
 def _words(layout: Mapping[str, Any]) -> str:
-    sensors = " and ".join(str(shape) for shape in layout["sensors"]) or "nothing"
+    shapes = [str(shape) for shape in layout["sensors"]]
+    for index, dim in enumerate(layout.get(CHANNELS, ())):
+        shapes[index] += {None: "", FIRST: " (channels first)", LAST: " (channels last)"}[dim]
+    sensors = " and ".join(shapes) or "nothing"
     actions = [f"{layout['continuous']} continuous"] if layout["continuous"] else []
     actions += [f"discrete {layout['branches']}"] if layout["branches"] else []
     return f"observations {sensors} and actions {' and '.join(actions) or 'of no kind'}"

@@ -39,17 +39,24 @@ def compare(
         ExportError: they play differently.
     """
     session = open_session(data, "the export")
-    feed = _feed(session, sensors, sample)
+    network = actor[0].module
+    # behind a memory stands the actor that it was put into
+    encoder = (network.actor if actor.has_memory else network).encoder
+    feed = _feed(session, encoder, sensors, sample)
     with torch.no_grad():
-        params = actor[0](TensorDict(sample, [len(next(iter(sample.values())))])).get("params")
-    expected = ActionDistribution(params, actor[0].module.layout, sample.get(keys.MASK))
+        out = actor[0](TensorDict(sample, [len(next(iter(sample.values())))]))
+    params = out.get("params")
+    expected = ActionDistribution(params, actor.layout, sample.get(keys.MASK))
 
     found = _run(session, feed, "deterministic_", expected)
     error = max(_continuous_error(expected, found), _branch_error(expected, found))
+    if actor.has_memory:
+        after = torch.from_numpy(session.run(["recurrent_out"], feed)[0][:, 0])
+        error = max(error, float((after - out.get(keys.MEMORY_AFTER)).abs().max()))
     # Asked this way round because nan, which is above no tolerance, must not pass.
     if not error <= TOLERANCE:
         raise ExportError(
-            "the export plays otherwise than the checkpoint: its deterministic actions differ by "
+            "the export plays otherwise than the checkpoint: its deterministic actions (or memory) differ by "
             f"{error:.3g}, more than {TOLERANCE:g}"
         )
 
@@ -63,11 +70,12 @@ def compare(
 
 
 def _feed(
-    session: Any, sensors: Sequence[Sequence[int]], sample: dict[str, torch.Tensor]
+    session: Any, encoder: Any, sensors: Sequence[Sequence[int]], sample: dict[str, torch.Tensor]
 ) -> dict[str, np.ndarray]:
     """Split an actor's inputs into those of the graph."""
     arrays = {key: values.numpy() for key, values in sample.items()}
     shapes = {i.name: list(i.shape) for i in session.get_inputs()}
+    images = iter(encoder.images)
     feed, start = {}, 0
 
     # The actor takes all vectors as one entry; each sensor has its columns of it, in their order.
@@ -77,10 +85,13 @@ def _feed(
             feed[name] = arrays[keys.OBS][:, start : start + shape[0]]
             start += shape[0]
         else:
-            feed[name] = fit_image(arrays[keys.SENSOR.format(index)], shapes[name])
+            image = arrays[keys.SENSOR.format(index)]
+            feed[name] = fit_image(image, shapes[name], next(images).channels_last)
 
     if keys.MASK in arrays:
         feed["action_masks"] = arrays[keys.MASK]
+    if keys.MEMORY in arrays:
+        feed["recurrent_in"] = arrays[keys.MEMORY][:, None]
 
     return {name: np.ascontiguousarray(values, np.float32) for name, values in feed.items()}
 

@@ -5,7 +5,8 @@ itself writes (opset 9, which Sentis and the Inference Engine import), whatever 
 
     inputs   obs_0 ... obs_n  float32 [batch, size] or [batch, C, H, W], in the order of the sensors
              action_masks     float32 [batch, sum of branches], 1 = allowed; only with branches
-    outputs  version_number, memory_size                   float32 [1]: 3 and 0
+             recurrent_in     only with a memory, see `onnx_memory`
+    outputs  version_number, memory_size                   float32 [1]: 3; 0 or M
              continuous_actions, deterministic_..._actions float32 [batch, C], in [-1, 1]
              continuous_action_output_shape                float32 [1]: C
              discrete_actions, deterministic_..._actions   int64 [batch, K], branch indices
@@ -25,7 +26,9 @@ from mappo_unity.config.option_table import with_article
 from mappo_unity.config.packages import PER_MEMBER, ExportError, import_package
 from mappo_unity.learning.actor_critic import Actor, PerMember
 from mappo_unity.learning.encoders import OBS_CLIP, Encoder
+from mappo_unity.learning.recurrent import RecurrentActor
 from mappo_unity.policies.onnx_actions import BATCH, add_actions
+from mappo_unity.policies.onnx_memory import add_memory
 
 FORMAT = 3.0  # ML-Agents' ModelApiVersion.MLAgents2_0: an input for each sensor, actions drawn in the graph
 OPSET, IR_VERSION = 9, 4  # those of the files that ML-Agents writes
@@ -49,16 +52,19 @@ def build_model(
         ExportError: the onnx package is missing, or the actor has a part that cannot be exported.
     """
     onnx = import_package("onnx")
-    network = _check_network(actor)
+    memory = actor.memory if isinstance(actor, RecurrentActor) else None
+    network = _check_network(actor.actor if isinstance(actor, RecurrentActor) else actor)
     graph = Graph(onnx)
     graph.tell("version_number", [FORMAT], [1])
-    graph.tell("memory_size", [0.0], [1])
+    graph.tell("memory_size", [float(memory.state_size if memory is not None else 0)], [1])
 
     # The last layer gives all actions at once; the graph has one of its own for each kind.
-    *body, head = network.net
+    *body, head = [*network.net, actor.head] if isinstance(actor, RecurrentActor) else network.net
     if not isinstance(head, nn.Linear):
         raise ExportError(f"the policy network ends in {with_article(type(head).__name__)}, not in a Linear")
     hidden = graph.layers(body, _features(graph, network.encoder, sensors), "net")
+    if memory is not None:
+        hidden = add_memory(graph, memory, hidden, BATCH)
     add_actions(graph, hidden, head, network)
 
     model = onnx.helper.make_model(
@@ -89,6 +95,11 @@ class Graph:
         output = output or f"{op.lower()}_{len(self.nodes)}"
         self.nodes.append(self.onnx.helper.make_node(op, inputs, [output], name=f"/{output}", **attributes))
         return output
+
+    def node_of_several(self, op: str, inputs: list[str], outputs: list[str], **attributes: Any) -> None:
+        """Add an operator with several outputs."""
+        node = self.onnx.helper.make_node(op, inputs, outputs, name=f"/{outputs[0]}", **attributes)
+        self.nodes.append(node)
 
     def constant(self, name: str, values: Any, dtype: type = np.float32) -> str:
         """Add a weight; return its name."""

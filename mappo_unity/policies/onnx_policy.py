@@ -19,6 +19,7 @@ from mappo_unity import keys
 from mappo_unity.config.packages import import_package
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.policy_files import SUFFIX
+from mappo_unity.scenes.contract.images import LAST, channel_dim
 
 
 class OnnxPolicy:
@@ -163,17 +164,18 @@ class OnnxPolicy:
 
     def _feed(self, behavior: str, steps: DecisionSteps, spec: BehaviorSpec) -> dict[str, np.ndarray]:
         vectors = [o for o in steps.obs if o.ndim == 2]
-        images = [o for o in steps.obs if o.ndim == 4]
+        images = [i for i, o in enumerate(steps.obs) if o.ndim == 4]
+        last = [channel_dim(sensor) == LAST for sensor in spec.observation_specs]
 
         feed = {}
         for name, shape in self.inputs.items():
             index = int(name.rpartition("_")[2]) if name.startswith(("obs_", "visual_")) else 0
             if name.startswith("obs_"):
-                feed[name] = fit_image(steps.obs[index], shape)
+                feed[name] = fit_image(steps.obs[index], shape, last[index])
             elif name == "vector_observation":
                 feed[name] = np.concatenate(vectors, axis=1)
             elif name.startswith("visual_"):
-                feed[name] = fit_image(images[index], shape)
+                feed[name] = fit_image(steps.obs[images[index]], shape, last[images[index]])
             elif name == "action_masks":
                 feed[name] = _allowed(steps, spec.action_spec.discrete_branches)
             else:  # recurrent_in, the only one left after `check`
@@ -262,10 +264,14 @@ def open_session(data: bytes, name: str, seed: int = 0) -> Any:
         raise ConfigError(f"{name} is no ONNX model that onnxruntime can run: {reason}") from error
 
 
-def fit_image(values: np.ndarray, shape: Sequence[Any]) -> np.ndarray:
-    """Turn images ``[n, H, W, C]`` into ``[n, C, H, W]`` where the model's input has that shape."""
+def fit_image(values: np.ndarray, shape: Sequence[Any], channels_last: bool) -> np.ndarray:
+    """Turn images ``[n, H, W, C]`` into ``[n, C, H, W]`` where the model's input has that shape.
+
+    `channels_last`: what the sensor says, for images whose shape is the same both ways.
+    """
     size = list(values.shape[1:])
-    if len(size) == 3 and size != list(shape[1:]) == _channels_first(size):
+    fits = len(size) == 3 and list(shape[1:]) == _channels_first(size)
+    if fits and (channels_last or size != list(shape[1:])):
         return values.transpose(0, 3, 1, 2)
     return values
 

@@ -18,7 +18,7 @@ from mappo_unity.config.schema import ModelConfig, bounded_log_std
 from mappo_unity.learning.actor_critic import PerMember, make_actor
 from mappo_unity.learning.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.encoders import ObsLayout
-from mappo_unity.policies.layouts import check_layout
+from mappo_unity.policies.layouts import CHANNELS, check_layout
 from mappo_unity.policies.members import MemberTable, Places, team_places
 from mappo_unity.runs import checkpoint
 
@@ -202,7 +202,9 @@ def _actor(state: dict[str, Any], name: str) -> Any:
         ActionSpec(layout["continuous"], tuple(layout["branches"])), model.flatten_branches
     )
 
-    actor = make_actor(ObsLayout.from_shapes(layout["sensors"]), actions, layout["team_size"], model)
+    # what an older checkpoint does not tell is guessed, as it was then
+    obs = ObsLayout.from_shapes(layout["sensors"], layout.get(CHANNELS))
+    actor = make_actor(obs, actions, layout["team_size"], model)
     actor.load_state_dict(state["learners"][name]["actor"])
     return actor.eval()
 

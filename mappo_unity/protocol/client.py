@@ -32,6 +32,7 @@ from mappo_unity.protocol.player_failures import (
 from mappo_unity.protocol.player_options import PlayerOptions
 from mappo_unity.protocol.process import PlayerProcess
 from mappo_unity.protocol.server import Link, LinkTimeout
+from mappo_unity.scenes.contract.images import sends_channels_last
 
 CLOSE_S = 5.0  # how long a player may take to leave before it is killed
 
@@ -259,7 +260,7 @@ class UnityPlayer(BaseEnv):
                 continue
 
             # Which sensors there are only an agent's message says; hence the wait for one.
-            spec = behavior_spec(brain, infos[name].value[0])
+            spec = behavior_spec(brain, infos[name].value[0], sends_channels_last(self.handshake))
             self._decoders[name] = BehaviorDecoder(name, spec)
             self._encoders[name] = ActionEncoder(spec, old=not self.handshake.capabilities.hybridActions)
 

@@ -18,6 +18,7 @@ from mlagents_envs.base_env import (
 
 from mappo_unity.protocol.batch_encoding import VARINT_BYTES, Layout, float_columns, packed_varints
 from mappo_unity.protocol.messages import API_VERSION, CAPABILITIES, PNG, delimited, map_entry, varint
+from mappo_unity.scenes.contract.images import LAST, channel_dim, mark_channels_last
 
 
 class MalformedMessage(Exception):
@@ -103,7 +104,9 @@ class BehaviorDecoder:
         if 1 in (shape[0], shape[2]) and image.shape[2] == 3:  # grey, sent as a colour picture
             image = image.mean(axis=2, keepdims=True)
 
-        if shape[1:] == image.shape[:2]:  # channels first: ML-Agents 3 and later
+        # Both ways where all sizes are equal; then the sensor says which it is.
+        one_size = len(set(shape)) == 1 and channel_dim(self.spec.observation_specs[index]) == LAST
+        if shape[1:] == image.shape[:2] and not one_size:  # channels first: ML-Agents 3 and later
             image = np.moveaxis(image[:, :, : shape[0]], 2, 0)
         else:
             image = image[:, :, : shape[2]]
@@ -177,11 +180,15 @@ class ActionEncoder:
         return self._row.rows(len(next(iter(columns.values()))), columns).tobytes()
 
 
-def behavior_spec(brain: Any, info: Any) -> BehaviorSpec:
-    """Return the spec that a BrainParametersProto and an agent's first message describe."""
+def behavior_spec(brain: Any, info: Any, channels_last: bool = False) -> BehaviorSpec:
+    """Return the spec that a BrainParametersProto and an agent's first message describe.
+
+    `channels_last`: how the player lays out images that say nothing of it (`sends_channels_last`).
+    """
     from mlagents_envs.rpc_utils import behavior_spec_from_proto
 
-    return behavior_spec_from_proto(brain, info)
+    spec = behavior_spec_from_proto(brain, info)
+    return mark_channels_last(spec) if channels_last else spec
 
 
 def initialization(seed: int, num_areas: int, package_version: str) -> bytes:

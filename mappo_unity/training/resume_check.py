@@ -8,7 +8,7 @@ from typing import Any
 
 from mappo_unity.config.schema import ModelConfig, bounded_log_std
 from mappo_unity.envs.unity_env import UnityEnv
-from mappo_unity.policies.layouts import describe_spec
+from mappo_unity.policies.layouts import describe_spec, same_layout
 from mappo_unity.runs.checkpoint import CheckpointError
 
 
@@ -30,7 +30,10 @@ def check_compatible(
             f"checkpoint {path} was written for env={state['env_name']}, not for env={env_name}"
         )
 
-    if state["layout"] != layout:
+    saved_layout = state["layout"]
+    if saved_layout.keys() != layout.keys() or not all(
+        same_layout(saved_layout[name], layout[name]) for name in layout
+    ):
         raise CheckpointError(
             f"checkpoint {path} was written for policies {state['layout']}, but the environment has {layout}"
         )

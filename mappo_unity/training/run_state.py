@@ -13,6 +13,7 @@ from mappo_unity.config.per_behavior import behavior_config
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import sample_inputs
+from mappo_unity.policies.layouts import guessed_otherwise, without_channels
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
 from mappo_unity.training.batches import Batch
@@ -148,6 +149,8 @@ class RunState:
         """
         state = checkpoint.load(path)
         check_compatible(path, state, self.cfg.env.name, self._layout(), self._models())
+        if guessed_otherwise(state["layout"], self._layout()):
+            self.setup.guess_channels()
 
         for name, learner in self.setup.learners.items():
             learner.load_state_dict(state["learners"][name])
@@ -182,7 +185,9 @@ class RunState:
             ) from error
 
     def _layout(self) -> dict[str, Any]:
-        return describe_policies(self.setup.env)
+        # networks that guess their channels stay those of a checkpoint that does not tell
+        layout = describe_policies(self.setup.env)
+        return without_channels(layout) if self.setup.guesses_channels else layout
 
     def _models(self) -> dict[str, Any]:
         return describe_models({name: behavior_config(self.cfg, name)[0] for name in self.setup.learners})

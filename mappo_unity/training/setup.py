@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import torch
+from mlagents_envs.base_env import ObservationSpec
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType
 
@@ -29,6 +30,7 @@ from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
+from mappo_unity.scenes.contract.images import looks_unmarked
 from mappo_unity.training.batches import Batch, BatchCollector, count_present
 from mappo_unity.training.memory import check_free, show_size
 
@@ -48,7 +50,7 @@ class TrainingSetup:
         env: the environment, open.
 
     Attributes: `learners` by policy name; `policy`, their actors as one; `rounds` of a batch; `notes`, lines
-    for the user.
+    for the user; `guesses_channels`, whether `guess_channels` built the networks.
 
     Raises:
         ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
@@ -58,7 +60,17 @@ class TrainingSetup:
         self.cfg, self.env = cfg, env
         self.notes = [f"note: {cfg.env.note}"] if cfg.env.note is not None else []
 
-        self.learners = make_learners(cfg, env, batch_rounds(cfg.collect, env), self.notes.append)
+        self.guesses_channels = False
+        self._make_learners(self.notes.append)
+
+    def guess_channels(self) -> None:
+        """Build the networks again as older versions did: an image's smaller dimension holds its channels."""
+        self.guesses_channels = True
+        self._make_learners(lambda note: None)
+
+    def _make_learners(self, note: Callable[[str], None]) -> None:
+        rounds = batch_rounds(self.cfg.collect, self.env)
+        self.learners = make_learners(self.cfg, self.env, rounds, note, self.guesses_channels)
         self.policy = JointPolicy({name: learner.actor for name, learner in self.learners.items()})
 
     @contextmanager
@@ -158,7 +170,11 @@ def make_collector(env: EnvBase, policy: JointPolicy, rounds: int = 1, device: s
 
 
 def make_learners(
-    cfg: Config, env: UnityEnv, rounds: int, note: Callable[[str], None]
+    cfg: Config,
+    env: UnityEnv,
+    rounds: int,
+    note: Callable[[str], None],
+    guess_channels: bool = False,
 ) -> dict[str, PolicyLearner]:
     """Build networks and learner of every policy name.
 
@@ -166,7 +182,9 @@ def make_learners(
         cfg: the run's options.
         env: what is played.
         rounds: of a batch.
-        note: takes a line for the user about an option that does not fit and follows another.
+        note: takes a line for the user about an option that does not fit and follows another, or about an
+            image that says nothing of its channels.
+        guess_channels: see `ObsLayout.from_shapes`.
 
     Raises:
         ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
@@ -182,7 +200,11 @@ def make_learners(
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
         check_minibatches(name, ppo, rounds, teams, team_size, note)
 
-        obs = ObsLayout.from_specs(behavior.spec.observation_specs)
+        sensors = behavior.spec.observation_specs
+        obs = ObsLayout.from_specs(sensors)
+        if guess_channels:
+            obs = ObsLayout.from_shapes([sensor.shape for sensor in sensors])
+        note_unmarked(name, sensors, note)
         layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
         check_network_memory(name, obs, layout, team_size, model)
 
@@ -192,6 +214,17 @@ def make_learners(
         learners[name] = PolicyLearner(actor, critic, ppo)
 
     return learners
+
+
+def note_unmarked(name: str, sensors: Sequence[ObservationSpec], note: Callable[[str], None]) -> None:
+    """Note images that mark no dimension, are taken for ``C, H, W``, and look like ``H, W, C``."""
+    for sensor in filter(looks_unmarked, sensors):
+        channels, height, width = sensor.shape
+        note(
+            f"note: sensor {sensor.name!r} of {name} has shape {tuple(sensor.shape)} and marks no "
+            f"dimensions: it is taken for {channels} channels of {height} x {width}; mark height and width "
+            "with dimension_property where that is not so"
+        )
 
 
 def check_minibatches(
