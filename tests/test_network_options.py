@@ -249,9 +249,8 @@ def test_a_run_trains_exports_and_resumes(options, tmp_path):
     ends = [checkpoint.load(path)["learners"]["3DBall"]["actor"] for path in (unbroken, resumed)]
     assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
 
-    if "memory" not in options:
-        onnx = OnnxPolicy(whole / "checkpoints" / "final.onnx", deterministic=True)
-        assert onnx.agent_steps == 256
+    onnx = OnnxPolicy(whole / "checkpoints" / "final.onnx", deterministic=True)
+    assert onnx.agent_steps == 256
     CheckpointPolicy(whole / "checkpoints" / "best.pt", deterministic=True)
     model = checkpoint.load(unbroken)["model"]["3DBall"]
     assert {name: model[name] for name in options} == {

@@ -39,7 +39,10 @@ def compare(
         ExportError: they play differently.
     """
     session = open_session(data, "the export")
-    feed = _feed(session, actor[0].module.encoder, sensors, sample)
+    network = actor[0].module
+    # behind a memory stands the actor that it was put into
+    encoder = (network.actor if actor.has_memory else network).encoder
+    feed = _feed(session, encoder, sensors, sample)
     with torch.no_grad():
         out = actor[0](TensorDict(sample, [len(next(iter(sample.values())))]))
     params = out.get("params")
