@@ -25,7 +25,7 @@ from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
 from mappo_unity.learning.networks.mlp import make_mlp
 from mappo_unity.scenes import make_scene
-from mappo_unity.training.setup import entries_of, set_up
+from mappo_unity.training.setup import set_up
 from mappo_unity.training.trainer import train
 
 
@@ -87,7 +87,7 @@ def collection(cfg: Config, repeats: int) -> None:
         set_up(cfg, Path(folder)) as setup,
         setup.collecting() as batches,
     ):
-        rounds = setup.rounds
+        rounds = next(batches).rounds.shape[0]
         bare = BareLoop(cfg)
         next(batches), bare.collect(rounds)
         ours, theirs, ratios = [], [], []
@@ -133,17 +133,17 @@ def updates(cfg: Config, repeats: int) -> None:
         setup.collecting() as batches,
     ):
         name, learner = next(iter(setup.learners.items()))
-        entries = entries_of(next(batches), name)
-        rows, _ = learner._prepare(entries)
+        buffer, _ = learner.prepare(next(batches).of(name))
+        rows = buffer[:]
         hand = HandWritten(cfg)
         data = [
             rows[key].flatten(0, 1)
             for key in ("observation", "action", "action_log_prob", "advantage", "value_target")
         ]
-        learner._update(rows), hand.update(data)
+        learner.update(buffer), hand.update(data)
         ours, theirs, ratios = [], [], []
         for _ in range(repeats):
-            ours.append(timed(lambda: learner._update(rows)))
+            ours.append(timed(lambda: learner.update(buffer)))
             theirs.append(timed(lambda: hand.update(data)))
             ratios.append(theirs[-1] / ours[-1])
         print(

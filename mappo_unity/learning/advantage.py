@@ -104,8 +104,10 @@ def _row(values: Tensor) -> np.ndarray:
     return values.cpu().numpy().reshape(-1)
 
 
-def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Return the mean of ``values`` where ``mask`` holds (0 if nowhere), a scalar."""
+def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the mean of ``values`` where ``mask`` holds (0 if nowhere; None: everywhere), a scalar."""
+    if mask is None:
+        return values.mean()
     weight = mask.to(torch.get_default_dtype())
     return (values * weight).sum() / weight.sum().clamp_min(1.0)
 

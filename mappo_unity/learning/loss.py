@@ -21,8 +21,8 @@ from mappo_unity.learning.networks.distributions import ActionDistribution
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import RecurrentCritic
 
-ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: the slot acted and the outcome is known
-CRITIC_LEARNS = "critic_learns"  # bool [rows, A, 1]: the same, or its agent departed while a team mate acted
+ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: it acted, and the outcome is known; absent: all
+CRITIC_LEARNS = "critic_learns"  # bool [rows, A, 1]: the same, or it departed while a team mate acted
 BASELINE = "baseline"  # float32 [rows, A, 1]: what a POCA critic said before the update, normalised
 TEAM = "team"  # with memory: the critic's inputs of the whole team, [B, L, A, *]
 MEMBER = "member"  # with memory: int64 [B], the slot of the team whose decisions the sequence holds
@@ -36,7 +36,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         actor, critic: see `learning.networks.actor_critic`.
         cfg: the learner's options.
 
-    Attributes: `log_ratio` ``[..., n]`` and `entropy` ``[...]`` of the last call, without gradients.
+    Attributes: `log_ratio` ``[..., n]`` and `entropy` ``[..., 1]`` of the last call, without gradients.
     """
 
     def __init__(self, actor: UnityActor, critic: TensorDictModule, cfg: PPOConfig) -> None:
@@ -61,24 +61,24 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         Args:
             rows: team rows ``[R, A]``; with a memory, sequences ``[B, L]`` of single agents.
         """
-        clip, mask = self.clip_epsilon.item(), rows.get(ACTOR_LEARNS)
+        clip, mask = self.clip_epsilon.item(), rows.get(ACTOR_LEARNS, None)
         dist = self._distribution(rows)
         self.log_ratio, ratio = self._ratio(dist, rows, mask)
 
         advantage = rows.get(keys.ADVANTAGE)
         gain = torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
-        entropy = dist.entropy(mean=self.cfg.entropy is EntropyKind.mean)
+        entropy = dist.entropy(mean=self.cfg.entropy is EntropyKind.mean).unsqueeze(-1)
         self.entropy = entropy.detach()
 
         return {
             "loss_objective": -masked_mean(gain.mean(-1, keepdim=True), mask),
             "loss_critic": self.cfg.value_coef * self._critic_loss(rows, clip),
-            "loss_entropy": -self.entropy_coeff.item() * masked_mean(entropy.unsqueeze(-1), mask),
+            "loss_entropy": -self.entropy_coeff.item() * masked_mean(entropy, mask),
         }
 
     def compare(self, rows: TensorDictBase) -> None:
         """Set `log_ratio` to what the policy now makes of these rows, without the rest of the loss."""
-        self.log_ratio, _ = self._ratio(self._distribution(rows), rows, rows.get(ACTOR_LEARNS))
+        self.log_ratio, _ = self._ratio(self._distribution(rows), rows, rows.get(ACTOR_LEARNS, None))
 
     def _distribution(self, rows: TensorDictBase) -> ActionDistribution:
         obs = [rows.get(key) for key in self._actor.obs_keys]
@@ -87,7 +87,9 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         mask = rows.get(keys.MASK) if self._actor.layout.branches else None
         return ActionDistribution(params, self._actor.layout, mask)
 
-    def _ratio(self, dist: ActionDistribution, rows: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
+    def _ratio(
+        self, dist: ActionDistribution, rows: TensorDictBase, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """Return log-ratios (detached) and ratios ``[..., n]``: of the whole action, or of its components."""
         if self.cfg.ratio is RatioKind.component:
             new, old = dist.component_log_probs(rows.get(keys.ACTION)), rows.get(keys.LOG_PROBS)
@@ -97,12 +99,13 @@ class MaskedClipPPOLoss(ClipPPOLoss):
                 rows.get(keys.LOG_PROB).unsqueeze(-1),
             )
 
-        # what stands in rows that do not count may be anything
-        log_ratio = torch.where(mask, new - old, 0.0)
+        log_ratio = new - old
+        if mask is not None:  # what stands in rows that do not count may be anything
+            log_ratio = torch.where(mask, log_ratio, 0.0)
         return log_ratio.detach(), log_ratio.exp()
 
     def _critic_loss(self, rows: TensorDictBase, clip: float) -> Tensor:
-        mask, target = rows.get(CRITIC_LEARNS), rows.get(keys.VALUE_TARGET)
+        mask, target = rows.get(CRITIC_LEARNS, None), rows.get(keys.VALUE_TARGET)
         value, baseline = self._values(rows)
 
         loss = self._distance(value, target, rows.get(keys.VALUE) if self.cfg.clip_value else None, clip)
@@ -112,7 +115,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
 
         # ML-Agents clips the baseline's move, and not the value's
         beside = self._distance(baseline, target, rows.get(BASELINE), clip)
-        return loss + BASELINE_WEIGHT * masked_mean(beside, rows.get(ACTOR_LEARNS))
+        return loss + BASELINE_WEIGHT * masked_mean(beside, rows.get(ACTOR_LEARNS, None))
 
     def _values(self, rows: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         """Return values, and baselines where the critic has them."""

@@ -226,33 +226,34 @@ class PolicyLearner:
             net.project()
 
         with torch.no_grad():
-            mask, log_ratio = minibatch.get(ACTOR_LEARNS), self.loss.log_ratio
+            mask, log_ratio = minibatch.get(ACTOR_LEARNS, None), self.loss.log_ratio
             clipped = ((log_ratio.exp() - 1).abs() > self.loss.clip_epsilon.item()).float()
             return {
                 "policy_loss": losses["loss_objective"].detach(),
                 "value_loss": losses["loss_critic"].detach(),
-                "entropy": masked_mean(self.loss.entropy.view(mask.shape), mask),
+                "entropy": masked_mean(self.loss.entropy, mask),
                 "kl": self._kl(mask),
                 "clip_fraction": masked_mean(clipped.mean(-1, keepdim=True), mask),
                 "grad_norm": grad_norm.detach(),
             }
 
-    def _kl(self, mask: Tensor) -> Tensor:
+    def _kl(self, mask: Tensor | None) -> Tensor:
         """Return the approximate KL of the last call of the loss."""
         log_ratio = self.loss.log_ratio.sum(-1, keepdim=True)
         # k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative
-        return masked_mean(torch.where(mask, log_ratio.exp() - 1 - log_ratio, 0.0), mask)
+        return masked_mean(log_ratio.exp() - 1 - log_ratio, mask)
 
     @torch.no_grad()
     def _kl_after(self, minibatch: TensorDictBase) -> Tensor:
         """Return the approximate KL on the last minibatch, now that its step is taken."""
         self.loss.compare(minibatch)
-        return self._kl(minibatch.get(ACTOR_LEARNS))
+        return self._kl(minibatch.get(ACTOR_LEARNS, None))
 
     @torch.no_grad()
     def _normalize_values(self, minibatch: TensorDictBase) -> None:
         """Take a minibatch's targets into the statistics and normalise its values by them."""
-        self.value_norm.update(minibatch.get(keys.VALUE_TARGET)[minibatch.get(CRITIC_LEARNS)])
+        targets, learns = minibatch.get(keys.VALUE_TARGET), minibatch.get(CRITIC_LEARNS, None)
+        self.value_norm.update(targets if learns is None else targets[learns])
         for key in (keys.VALUE_TARGET, keys.VALUE, BASELINE):
             if key in minibatch.keys():
                 minibatch.set(key, self.value_norm.normalize(minibatch.get(key)))

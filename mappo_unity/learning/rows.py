@@ -35,7 +35,13 @@ class TeamRows:
 
         # rows without an action to learn from would only dilute the minibatches
         learns = decisions > 0
-        return (rows, decisions) if bool(learns.all()) else (rows[learns], decisions[learns])
+        if not bool(learns.all()):
+            rows, decisions = rows[learns], decisions[learns]
+
+        # masks that hide nothing only cost time
+        if bool((decisions == rows.shape[-1]).all()):
+            rows = rows.exclude(ACTOR_LEARNS, CRITIC_LEARNS)
+        return rows, decisions
 
     def take(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return what the loss reads."""
