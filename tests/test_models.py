@@ -125,7 +125,8 @@ def test_draws_are_what_the_actor_writes_while_exploring(layout):
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         out = actor(entries.copy())
     torch.manual_seed(1)
-    action, log_prob = actor.draw(entries)
+    action, log_prob, parts, memory = actor.draw(entries)
+    assert parts is None and memory is None
     assert torch.equal(action, out["action"]) and action.dtype == out["action"].dtype
     assert torch.equal(log_prob, out["action_log_prob"]) and not log_prob.requires_grad
     policy = JointPolicy({"Fake": actor})

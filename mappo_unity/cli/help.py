@@ -127,4 +127,7 @@ def _group_text(group: str) -> str:
 
 def _wrap(text: str, indent: int) -> str:
     width = min(shutil.get_terminal_size((100, 24)).columns, 110)
-    return textwrap.fill(text, max(width, 40), initial_indent=" " * indent, subsequent_indent=" " * indent)
+    margin = " " * indent
+    return textwrap.fill(
+        text, max(width, 40), initial_indent=margin, subsequent_indent=margin, break_on_hyphens=False
+    )

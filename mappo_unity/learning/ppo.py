@@ -33,7 +33,7 @@ from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_
 from mappo_unity.learning.networks.encoders import RunningNorm
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.optimizer import clip_gradients, in_two_groups, make_optimizer
-from mappo_unity.learning.rows import SequenceRows, TeamRows
+from mappo_unity.learning.rows import make_rows
 from mappo_unity.learning.value_norm import ValueNorm, move_statistics
 from mappo_unity.learning.value_reader import ValueReader, Values
 
@@ -59,11 +59,7 @@ class PolicyLearner:
         written = [keys.ACTION, keys.LOG_PROB] + [keys.LOG_PROBS] * actor.keeps_components
         self.row_keys = list(dict.fromkeys([*inputs, *written]))
         self.carried = CarriedRounds(self.row_keys + [keys.FIRST] * actor.has_memory)
-        self.rows = (
-            SequenceRows(self.row_keys, self.reader.keys, critic.module, cfg)
-            if actor.has_memory
-            else (TeamRows(self.row_keys))
-        )
+        self.rows = make_rows(self.row_keys, critic, cfg)
 
         self.value_layers = value_layers(critic)  # which PopArt rescales
         self.has_baseline = any(isinstance(m, PocaCritic) for m in critic.modules())

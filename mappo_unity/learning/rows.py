@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from tensordict.nn import TensorDictModule
+from torch import Tensor
 
 from mappo_unity import keys
 from mappo_unity.config.schema import PPOConfig
@@ -59,9 +60,8 @@ class SequenceRows:
     """
 
     def __init__(
-        self, row_keys: list[str], critic_keys: list[str], critic: RecurrentCritic | nn.Module, cfg: PPOConfig
+        self, row_keys: list[str], critic_keys: list[str], critic: RecurrentCritic, cfg: PPOConfig
     ) -> None:
-        assert isinstance(critic, RecurrentCritic)
         self._critic, self._length = critic, cfg.sequence_length
         self._critic_keys = critic_keys
         self._keys = [key for key in row_keys if key not in (keys.MEMORY, keys.PRESENT, keys.DEPARTED)]
@@ -113,3 +113,10 @@ class SequenceRows:
 
     def _team(self, key: str, at: TensorDictBase) -> Tensor:
         return self._rounds[key][at.get(_ROUND), at.get(_TEAM_ROW).unsqueeze(-1)]
+
+
+def make_rows(row_keys: list[str], critic: TensorDictModule, cfg: PPOConfig) -> TeamRows | SequenceRows:
+    """Return what an update learns on: sequences where the critic (and so the actor) has a memory."""
+    if not isinstance(critic.module, RecurrentCritic):
+        return TeamRows(row_keys)
+    return SequenceRows(row_keys, [str(key) for key in critic.in_keys], critic.module, cfg)
