@@ -12,6 +12,7 @@ from mappo_unity.config.schema import (
     CriticKind,
     ModelConfig,
     PPOConfig,
+    RatioKind,
     Schedule,
     ValueLoss,
     ValueNormKind,
@@ -219,3 +220,54 @@ def test_departed_members_train_the_critic_and_not_the_policy():
     first, second = one.step(rows), two.step(other)
     assert first["policy_loss"] == second["policy_loss"]
     assert first["value_loss"] < second["value_loss"]
+
+
+def test_the_last_step_is_seen_by_the_guard():
+    # one minibatch, one epoch: before its step the KL is 0, after it enormous
+    learner = make_learner(lr=1.0, epochs=1, num_minibatches=1, max_kl=0.5)
+    before = copy.deepcopy(learner._trainable_state())
+    metrics = learner.learn(make_batch(learner), 0.0)
+    assert metrics["kl"] < 1e-6 and metrics["kl_last"] > 0.5 and metrics["rolled_back"] == 1.0
+    for name, value in before["actor"].items():
+        if "norm." not in name:
+            assert torch.equal(value, learner.actor.state_dict()[name])
+
+
+def test_value_clipping_follows_the_schedule():
+    learner = make_learner(
+        clip_value=True,
+        clip_epsilon=0.4,
+        clip_epsilon_final=0.2,
+        clip_schedule=Schedule.linear,
+        value_coef=1.0,
+    )
+    learner._set_schedules(0.5)
+    rows = prepared(learner, make_batch(learner))
+    with torch.no_grad():
+        value = learner.critic(rows.clone())["state_value"]
+    rows["state_value"], rows["value_target"] = value - 1.0, value.clone()
+    # the critic is right, and has moved by 1 since: only 0.3 of that count
+    expected = torch.nn.functional.huber_loss(value - 0.7, value, delta=10.0)
+    assert learner.loss(rows)["loss_critic"].item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_a_ratio_of_each_component_is_clipped_by_itself():
+    learner = make_learner(ratio=RatioKind.component, clip_epsilon=0.2)
+    batch = make_batch(learner)
+    with torch.no_grad():
+        batch["action_log_probs"] = learner.actor.draw(batch).log_probs
+        dist = learner.actor.get_dist(batch)
+        batch["action_log_probs"] = dist.component_log_probs(batch["action"])
+    rows = prepared(learner, batch)
+    rows["action_log_probs"] = rows["action_log_probs"] - torch.tensor([0.5, 0.0])
+    rows["advantage"] = torch.ones_like(rows["advantage"])
+    # the first component's ratio is e^0.5, clipped to 1.2; the second's is 1
+    assert learner.loss(rows)["loss_objective"].item() == pytest.approx(-1.1, abs=1e-4)
+
+
+def test_actor_and_critic_have_rates_and_norms_of_their_own():
+    learner = make_learner(lr=1e-3, critic_lr=1e-4, lr_schedule=Schedule.linear, separate_optimizers=True)
+    learner.learn(make_batch(learner), 0.5)
+    assert [group["lr"] for group in learner.optimizer.param_groups] == pytest.approx([5e-4, 5e-5])
+    free = make_learner(max_grad_norm=None)
+    assert free.learn(make_batch(free), 0.0)["grad_norm"] > 0

@@ -1,0 +1,87 @@
+#!/usr/bin/env python3
+"""Train a scene with its preset from several seeds, and evaluate what each run ends with.
+
+Runs lie in OUT/SCENE-seed; one that was cut off is resumed, one that is over is only evaluated. Each result
+is printed and appended to OUT/results.csv: date, scene, seed, decisions, seconds, mean return and its
+standard error over the episodes evaluated.
+
+    python scripts/learn_scene.py Hallway [--seeds 0 1 2] [--episodes 400] [--out outputs/learn]
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+HERE = Path(sys.executable).parent
+
+
+def main() -> None:
+    """Train and evaluate every seed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scene")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--episodes", type=int, default=400)
+    parser.add_argument("--out", type=Path, default=Path("outputs/learn"))
+    parser.add_argument("options", nargs="*", help="further options of mappo-train")
+    arguments = parser.parse_args()
+
+    for seed in arguments.seeds:
+        print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores", flush=True)
+        folder = arguments.out / f"{arguments.scene}-{seed}"
+        train(arguments.scene, seed, folder, arguments.options)
+        row = evaluate(arguments.scene, seed, folder, arguments.episodes)
+        print(row, flush=True)
+        append(arguments.out / "results.csv", row)
+
+
+def train(scene: str, seed: int, folder: Path, options: list[str]) -> None:
+    """Train a seed, or resume it where a run folder stands already."""
+    if (folder / "checkpoints").is_dir():
+        lines = [f"resume={folder}"]
+    else:
+        lines = [f"env={scene}", f"seed={seed}", f"hydra.run.dir={folder}", *options]
+    subprocess.run([HERE / "mappo-train", *lines], check=True)
+
+
+def evaluate(scene: str, seed: int, folder: Path, episodes: int) -> dict[str, object]:
+    """Evaluate the newest checkpoint, as it explores; return a row of results."""
+    newest = sorted((folder / "checkpoints").glob("step_*.pt"))[-1]
+    command = [HERE / "mappo-eval", f"run={newest}", f"episodes={episodes}"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    result = json.loads(done.stdout.splitlines()[-1])
+
+    with open(folder / "metrics.csv") as file:
+        seconds = float(list(csv.DictReader(file))[-1]["wall_s"])
+    return {
+        "date": time.strftime("%Y-%m-%d"),
+        "scene": scene,
+        "seed": seed,
+        "decisions": result["agent_steps"],
+        "seconds": round(seconds),
+        "mean_return": round(result["mean_return"], 3),
+        "stderr": round(result["stderr"], 3),
+        "episodes": result["episodes"],
+    }
+
+
+def append(path: Path, row: dict[str, object]) -> None:
+    """Append a row to a CSV file, which gets a head if it is new."""
+    is_new = not path.exists()
+    with open(path, "a", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        if is_new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+if __name__ == "__main__":
+    main()
