@@ -199,3 +199,11 @@ def test_what_its_code_raises_is_told_as_its_own(
     monkeypatch.setattr(module.Target, "act", fail)
     with pytest.raises(EnvironmentFailure, match="scene Target: its step raised OverflowError: too far"):
         env.step()
+
+
+def test_an_installed_scene_is_no_preset_and_the_message_says_how_it_is_chosen(
+    install: Install, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install("plus", Target="target_scene:RECORD")
+    assert train_main(["env=Target"]) == 2
+    assert "installed scene: env=custom env.backend=embedded env.name=Target" in capsys.readouterr().err

@@ -24,6 +24,13 @@ def conf_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "conf"
 
 
+def installed_scenes() -> list[str]:
+    """Return the names of scenes that installed packages bring; see `mappo_unity.scenes.registry`."""
+    from importlib.metadata import entry_points
+
+    return [entry.name for entry in entry_points(group="mappo_unity.scenes")]
+
+
 @cache
 def group_choices() -> dict[str, list[str]]:
     """Return the choices of every group under conf/ (Hydra's own groups left out), sorted."""
