@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mappo_unity.config.behavior_lines import to_hydra_syntax
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table, show_value
-from mappo_unity.config.presets import describe_choices, installed_scenes
+from mappo_unity.config.presets import describe_choices, hint_of_installed_scene
 from mappo_unity.config.schema import Config
 from mappo_unity.config.text_lines import LINE, parse_or_none, quoted_path
 from mappo_unity.errors import ConfigError
@@ -208,9 +208,7 @@ def _check_choice(override: Override, choices: list[str]) -> None:
         if isinstance(value, str) and value in choices or (value is None and group != "env"):
             continue
         name = show_value(value)
-        hint = did_you_mean(name, choices)
-        if group == "env" and name in installed_scenes():
-            hint = f" as a preset; the installed scene: env=custom env.backend=embedded env.name={name}"
+        hint = hint_of_installed_scene(group, name) or did_you_mean(name, choices)
         raise ConfigError(f"{group}={name} does not exist{hint}; choices: {', '.join(choices)}")
 
 

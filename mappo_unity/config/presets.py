@@ -24,11 +24,13 @@ def conf_dir() -> Path:
     return inside if inside.is_dir() else package.parent / "conf"
 
 
-def installed_scenes() -> list[str]:
-    """Return the names of scenes that installed packages bring; see `mappo_unity.scenes.registry`."""
+def hint_of_installed_scene(group: str, name: str) -> str:
+    """Say how a scene is chosen that an installed package brings (`mappo_unity.scenes.registry`)."""
     from importlib.metadata import entry_points
 
-    return [entry.name for entry in entry_points(group="mappo_unity.scenes")]
+    if group != "env" or name not in (entry.name for entry in entry_points(group="mappo_unity.scenes")):
+        return ""
+    return f" as a preset; the installed scene: env=custom env.backend=embedded env.name={name}"
 
 
 @cache
