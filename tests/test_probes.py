@@ -128,6 +128,17 @@ def test_only_critics_that_see_the_team_know_what_a_mate_knows(tmp_path, kind):
         assert error < 0.1
 
 
+@pytest.mark.parametrize(
+    ("kind", "low", "high"), [(CriticKind.central, 0.7, 1.3), (CriticKind.poca, 0.0, 0.1)]
+)
+def test_the_baseline_of_poca_takes_out_what_the_mates_did(tmp_path, kind, low, high):
+    # only the first's choice earns: the second's advantage is noise, unless its mate's action is known
+    ppo = {"lr": 1e-12, "critic_lr": 1e-2, "normalize_advantages": False}
+    setup, batch = learn("Credit", tmp_path, 30, model={"critic": kind}, ppo=ppo, rounds=16)
+    buffer, _ = setup.learners["Probe"].prepare(batch)
+    assert low <= buffer[:]["advantage"][:, 1].var().item() <= high
+
+
 def test_a_member_that_ends_early_learns_from_what_its_team_earns_later(tmp_path):
     _, batch = learn("EarlyDeath", tmp_path, 80, ppo={"death_masking": True, "lr": 1e-2}, rounds=12)
     first = batch["acting"][..., 0, 0]
