@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=400)
     parser.add_argument("--out", type=Path, default=Path("outputs/learn"))
     parser.add_argument("options", nargs="*", help="further options of mappo-train")
-    arguments = parser.parse_args()
+    arguments = parser.parse_intermixed_args()  # options may stand anywhere
 
     for seed in arguments.seeds:
         print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores", flush=True)
