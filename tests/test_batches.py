@@ -15,6 +15,7 @@ from mappo_unity.config.schema import (
     Backend,
     CollectConfig,
     Config,
+    CriticKind,
     EnvConfig,
     LogConfig,
     ModelConfig,
@@ -145,3 +146,25 @@ def test_a_rest_gets_no_step_of_its_own() -> None:
     cfg = PPOConfig(minibatch_size=1024)
     assert [minibatch_count(cfg, n, n) for n in (4096, 4100, 4700, 100)] == [4, 4, 5, 1]
     assert minibatch_count(PPOConfig(num_minibatches=8), 100, 5) == 5
+
+
+def staggered_team(seed: int) -> Any:
+    """Return a BaseEnv of a team: agent 0 decides once and waits, its mate earns 1 in each round."""
+    script = [[Record(0, group=1), Record(1, group=1)], *([[Record(1, group=1, reward=1.0)]] * 5)]
+    ends = [Record(n, group=1, ends="terminated", reward=float(n)) for n in (0, 1)]
+    script.append([*ends, Record(0, group=1), Record(1, group=1)])
+    return ScriptedEnv(script + [[Record(0, group=1), Record(1, group=1)]] * 40)
+
+
+def test_with_poca_a_pending_decision_earns_what_its_mates_earn(tmp_path: Path) -> None:
+    cfg = options(staggered_team, rounds=3)
+    cfg.model.critic = CriticKind.poca
+    with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
+        (learner,) = setup.learners.values()
+        first = next(batches).of("Fake")
+        learner.prepare(first)
+        log_prob = first[keys.LOG_PROB][0, 0, 0]
+        buffer, _ = learner.prepare(next(batches).of("Fake"))
+        rows = buffer[:]
+        old = rows[keys.LOG_PROB] == log_prob
+        assert rows[keys.VALUE_TARGET].squeeze(-1)[old].tolist() == pytest.approx([6.0])

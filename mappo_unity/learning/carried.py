@@ -31,10 +31,12 @@ class CarriedRounds:
 
     Args:
         row_keys: entries that the networks read or wrote.
+        shares_rewards: every member earns the sum of its team's individual rewards, as in MA-POCA, whose
+            value is the whole team's.
     """
 
-    def __init__(self, row_keys: list[str]) -> None:
-        self._row_keys = row_keys
+    def __init__(self, row_keys: list[str], shares_rewards: bool = False) -> None:
+        self._row_keys, self._shares_rewards = row_keys, shares_rewards
         self.rounds: TensorDict | None = None  # [P, ..., A]
 
     def join(self, batch: TensorDictBase) -> TensorDict:
@@ -46,6 +48,9 @@ class CarriedRounds:
         entries = {key: batch.get(key) for key in self._row_keys}
         entries |= {keys.ACTING: batch.get(keys.ACTING), VALUED: has_value(batch)}
         entries |= {key: following.get(key) for key in (*_SUMS, *_ENDS)}
+        if self._shares_rewards:
+            own = entries[keys.REWARD]
+            entries[keys.REWARD] = own.sum(-2, keepdim=True).expand_as(own)
         rounds = TensorDict(entries, batch.batch_size)
         return rounds if self.rounds is None else torch.cat([self.rounds, rounds], 0)
 

@@ -58,11 +58,11 @@ class PolicyLearner:
         inputs = [str(key) for net in (actor, critic) for key in net.in_keys]
         written = [keys.ACTION, keys.LOG_PROB] + [keys.LOG_PROBS] * actor.keeps_components
         self.row_keys = list(dict.fromkeys([*inputs, *written]))
-        self.carried = CarriedRounds(self.row_keys + [keys.FIRST] * actor.has_memory)
+        self.has_baseline = any(isinstance(m, PocaCritic) for m in critic.modules())
+        self.carried = CarriedRounds(self.row_keys + [keys.FIRST] * actor.has_memory, self.has_baseline)
         self.rows = make_rows(self.row_keys, critic, cfg)
 
         self.value_layers = value_layers(critic)  # which PopArt rescales
-        self.has_baseline = any(isinstance(m, PocaCritic) for m in critic.modules())
         self.bounded = [m for m in actor.modules() if isinstance(m, Actor)]
         self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
@@ -131,10 +131,8 @@ class PolicyLearner:
         return (make_buffer(rows, decisions, self.cfg) if len(rows) else None), metrics
 
     def _rewards(self, rounds: TensorDict) -> Tensor:
-        """Return the weighted rewards of each round; MA-POCA's value is the team's, of all its rewards."""
+        """Return the weighted rewards of each round."""
         own = self.cfg.reward_weight * rounds.get(keys.REWARD)
-        if self.has_baseline:
-            own = own.sum(-2, keepdim=True).expand_as(own)
         return own + self.cfg.group_reward_weight * rounds.get(keys.GROUP_REWARD)
 
     def _enter(self, rounds: TensorDict, values: Values, gae: Advantage, learns: Tensor) -> None:
