@@ -4,10 +4,11 @@ import math
 
 import pytest
 import torch
+from masked import masked_gae
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from mappo_unity.config.schema import Schedule
-from mappo_unity.learning.advantage import explained_variance, masked_gae, masked_mean, normalize, scheduled
+from mappo_unity.learning.advantage import explained_variance, masked_mean, normalize, scheduled
 
 
 def gae(

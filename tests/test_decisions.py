@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from masked import masked_gae
 
-from mappo_unity.learning.advantage import masked_gae
 from mappo_unity.learning.decisions import DecisionView
 
 

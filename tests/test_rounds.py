@@ -5,12 +5,12 @@ import pytest
 import torch
 from fakes import Record as R
 from fakes import ScriptedEnv, behavior_spec
+from masked import masked_gae
 
 from mappo_unity.envs.slots import SlotTable
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.advantage import masked_gae
 from mappo_unity.learning.carried import has_value
 from mappo_unity.learning.networks.critics import seen_features
 from mappo_unity.scenes import make_scene

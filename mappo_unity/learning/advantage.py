@@ -30,39 +30,11 @@ from mappo_unity.learning.decisions import DecisionView
 
 
 class Advantage(NamedTuple):
-    """Result of `masked_gae`; every tensor is ``[T, ...]``."""
+    """Result of `estimate`; every tensor is ``[T, ...]``."""
 
     advantage: Tensor  # float32, 0 where not known
     target: Tensor  # float32, value targets (advantage + value), 0 where not known
     known: Tensor  # bool: rows with a decision whose outcome has arrived
-
-
-def masked_gae(
-    reward_T: Tensor,
-    value_T: Tensor,
-    end_value_T: Tensor,
-    final_value: Tensor,
-    valued_T: Tensor,
-    final_valued: Tensor,
-    terminated_T: Tensor,
-    truncated_T: Tensor,
-    *,
-    gamma: float,
-    gae_lambda: float,
-) -> Advantage:
-    """Estimate advantages of slots that do not act in every round, by the recursion above.
-
-    Args:
-        reward_T: float ``[T, ...]``, reward that arrived in a round.
-        value_T: float ``[T, ...]``, value of the row's observation (read where valued).
-        end_value_T: float ``[T, ...]``, value of the terminal observation (read where truncated).
-        final_value, final_valued: ``[...]``, value and mask of the row after the last.
-        valued_T, terminated_T, truncated_T: bool ``[T, ...]``.
-    """
-    view = make_view(valued_T, final_valued, terminated_T | truncated_T)
-    return estimate(
-        view, reward_T, value_T, end_value_T, final_value, truncated_T, gamma=gamma, gae_lambda=gae_lambda
-    )
 
 
 def make_view(valued_T: Tensor, final_valued: Tensor, ended_T: Tensor) -> DecisionView:
@@ -81,7 +53,16 @@ def estimate(
     gamma: float,
     gae_lambda: float,
 ) -> Advantage:
-    """Do the same for a view of the batch that stands already: each reward signal has its own values."""
+    """Estimate advantages of slots that do not act in every round, by the recursion above.
+
+    Args:
+        view: of the batch; every reward signal with values of its own uses the same one.
+        reward_T: float ``[T, ...]``, reward that arrived in a round.
+        value_T: float ``[T, ...]``, value of the row's observation (read where it has one).
+        end_value_T: float ``[T, ...]``, value of the terminal observation (read where truncated).
+        final_value: ``[...]``, value of the row after the last.
+        truncated_T: bool ``[T, ...]``, episodes cut off; other ends are real.
+    """
     value = _flat(value_T)
     following = view.next_values(value, _row(final_value), _flat(end_value_T), _flat(truncated_T))
     delta = view.rewards(_flat(reward_T)) + np.float32(gamma) * following - value

@@ -167,13 +167,6 @@ class UnityActor(ProbabilisticActor):
             return Draw(action, dist.log_prob(action), parts, after)
 
 
-def project(policy: nn.Module) -> None:
-    """Take the deviations of all actors of a policy back into their range."""
-    for module in policy.modules():
-        if isinstance(module, Actor):
-            module.project()
-
-
 def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig) -> UnityActor:
     """Build the policy as a TorchRL actor over the entries of one policy name."""
     squashed = cfg.action_distribution is DistributionKind.tanh_normal and layout.continuous > 0
