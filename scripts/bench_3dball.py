@@ -14,12 +14,11 @@ import os
 import resource
 import statistics
 import tempfile
-import time
 from pathlib import Path
 
 import torch
+from bench_update import measure, timed
 from mlagents_envs.base_env import ActionTuple
-from torch import nn
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
@@ -50,7 +49,7 @@ def main() -> None:
     )
     time_to_95(cfg)
     collection(cfg, arguments.repeats)
-    updates(cfg, arguments.repeats)
+    measure(cfg, arguments.repeats)
     for seed in range(arguments.seeds):
         whole_run(seed)
     print(f"peak resident memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
@@ -123,72 +122,6 @@ class BareLoop:
                 self.env.set_actions(self.name, ActionTuple(continuous=action.numpy()))
                 rounds -= 1
             self.env.step()
-
-
-def updates(cfg: Config, repeats: int) -> None:
-    """Compare the learner's epochs with a hand-written PPO update on the same rows."""
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        set_up(cfg, Path(folder)) as setup,
-        setup.collecting() as batches,
-    ):
-        name, learner = next(iter(setup.learners.items()))
-        buffer, _ = learner.prepare(next(batches).of(name))
-        rows = buffer[:]
-        hand = HandWritten(cfg)
-        data = [
-            rows[key].flatten(0, 1)
-            for key in ("observation", "action", "action_log_prob", "advantage", "value_target")
-        ]
-        learner.update(buffer), hand.update(data)
-        ours, theirs, ratios = [], [], []
-        for _ in range(repeats):
-            ours.append(timed(lambda: learner.update(buffer)))
-            theirs.append(timed(lambda: hand.update(data)))
-            ratios.append(theirs[-1] / ours[-1])
-        print(
-            f"update of {len(rows)} rows, {cfg.ppo.epochs} epochs: {statistics.median(ours) * 1e3:.0f} ms; "
-            f"hand-written {statistics.median(theirs) * 1e3:.0f} ms; speed ratio "
-            f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
-        )
-
-
-class HandWritten:
-    """A PPO update in plain PyTorch: the same networks, losses, clipping and optimizer."""
-
-    def __init__(self, cfg: Config) -> None:
-        self.cfg = cfg
-        hidden, activation = list(cfg.model.hidden), cfg.model.activation
-        self.actor = make_mlp(8, hidden, 2, activation, 0.01)
-        self.critic = make_mlp(8, hidden, 1, activation, 1.0)
-        self.log_std = nn.Parameter(torch.zeros(2))
-        self.params = [*self.actor.parameters(), *self.critic.parameters(), self.log_std]
-        self.optimizer = torch.optim.Adam(self.params, cfg.ppo.lr, eps=1e-5, fused=True)
-
-    def update(self, data: list[torch.Tensor]) -> None:
-        """Run the epochs over minibatches."""
-        for _ in range(self.cfg.ppo.epochs):
-            for index in torch.randperm(len(data[0])).split(self.cfg.ppo.minibatch_size):
-                obs, action, old, advantage, target = (x[index] for x in data)
-                dist = torch.distributions.Normal(self.actor(obs), self.log_std.exp(), validate_args=False)
-                ratio = (dist.log_prob(action).sum(-1) - old).exp()
-                gain = advantage.squeeze(-1)
-                clip = self.cfg.ppo.clip_epsilon
-                policy = -torch.minimum(ratio * gain, ratio.clamp(1 - clip, 1 + clip) * gain).mean()
-                value = nn.functional.huber_loss(self.critic(obs), target, delta=self.cfg.ppo.huber_delta)
-                entropy = dist.entropy().sum(-1).mean()
-                loss = policy + self.cfg.ppo.value_coef * value - self.cfg.ppo.entropy_coef * entropy
-                self.optimizer.zero_grad()
-                loss.backward()
-                nn.utils.clip_grad_norm_(self.params, self.cfg.ppo.max_grad_norm, foreach=True)
-                self.optimizer.step()
-
-
-def timed(work) -> float:  # type: ignore[no-untyped-def]
-    """Return the seconds that ``work()`` takes."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
 
 
 if __name__ == "__main__":

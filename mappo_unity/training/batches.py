@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -45,7 +45,7 @@ class Batch:
 
     def count_decisions(self, name: str) -> int:
         """Return how many agent decisions a policy made in it (ML-Agents' steps)."""
-        return int(self.rounds.get((name, keys.ACTING)).sum())
+        return count_decisions(self.rounds, [name])
 
 
 class BatchCollector:
@@ -74,7 +74,7 @@ class BatchCollector:
         while missing > 0:
             # not everybody is asked in every round: what is missing then is played in further parts
             parts.append(self._play(-(-missing // max(1, count_present(self._env)))))
-            missing -= sum(int(parts[-1].get((name, keys.ACTING)).sum()) for name in self._env.sides)
+            missing -= count_decisions(parts[-1], self._env.sides)
 
         return self._with_records(parts[0] if len(parts) == 1 else torch.cat(parts, 0))
 
@@ -92,6 +92,11 @@ class BatchCollector:
         batch.dropped_steps, batch.void = mask_crashed_episodes(rounds, crashes, env)
         batch.dropped_episodes = sum(int(crash.slots.sum()) for crash in crashes)
         return batch
+
+
+def count_decisions(rounds: TensorDictBase, names: Iterable[str]) -> int:
+    """Return how many agent decisions policies made in rounds ``[T]``."""
+    return sum(int(rounds.get((name, keys.ACTING)).sum()) for name in names)
 
 
 def count_present(env: UnityEnv) -> int:

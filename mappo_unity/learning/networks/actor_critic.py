@@ -214,7 +214,9 @@ def _critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: ActionLayo
     elif cfg.critic is not CriticKind.poca:
         net = PooledCritic(obs, team_size, cfg)
     else:
-        net = PocaCritic(obs, layout, team_size, cfg, head_size=output_size(cfg))
+        has_memory = cfg.memory is not MemoryKind.none
+        head_size = output_size(cfg.memory, cfg.memory_size) if has_memory else None
+        net = PocaCritic(obs, layout, team_size, cfg, head_size)
     return apply_options(net, cfg)
 
 

@@ -21,11 +21,9 @@ VALUE_STATE, BASELINE_STATE = "value_state", "baseline_state"
 """Entries of the critic's states, float32 [..., M]: a POCA critic's baseline remembers for itself."""
 
 
-def output_size(cfg: ModelConfig) -> int | None:
-    """Return the width of what a memory gives; None without one."""
-    if cfg.memory is MemoryKind.none:
-        return None
-    return cfg.memory_size // 2 if cfg.memory is MemoryKind.lstm else cfg.memory_size
+def output_size(kind: MemoryKind, memory_size: int) -> int:
+    """Return the width of what a memory gives: an LSTM's state is half output, half cell."""
+    return memory_size // 2 if kind is MemoryKind.lstm else memory_size
 
 
 class Memory(nn.Module):
@@ -41,7 +39,7 @@ class Memory(nn.Module):
         super().__init__()
         self.is_lstm = kind is MemoryKind.lstm
         self.state_size = memory_size
-        self.size = memory_size // 2 if self.is_lstm else memory_size
+        self.size = output_size(kind, memory_size)
         layer = nn.LSTM if self.is_lstm else nn.GRU
         self.layer = layer(inputs, self.size, batch_first=True)
         self._initialize()
