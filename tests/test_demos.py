@@ -258,7 +258,7 @@ def test_recordings_go_to_new_files_one_a_policy(tmp_path: Path) -> None:
     files = recording_files(tmp_path / "new" / "folder", both)
     assert files["Goal Keeper"] == tmp_path / "new" / "folder" / "Goal_Keeper.demo" and len(files) == 2
     with pytest.raises(
-        ConfigError, match=r"a file is of one: name a folder, such as \S+/run, for Striker.demo"
+        ConfigError, match=r"a file is of one: name a folder, such as \S+/run/, for Striker.demo"
     ):
         recording_files(tmp_path / "run.demo", both)
     with pytest.raises(ConfigError, match=r"run.mp4 must end in .demo, or be a folder for NAME.demo"):

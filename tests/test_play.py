@@ -177,7 +177,7 @@ def test_a_window_shows_frames_at_their_time() -> None:
         (
             ["env=WallJump", "record=run.demo"],
             "recording run.demo would be of several behaviors, but a file is of one: name a folder, such as "
-            "run, for SmallWallJump.demo and BigWallJump.demo",
+            "run/, for SmallWallJump.demo and BigWallJump.demo",
         ),
     ],
 )

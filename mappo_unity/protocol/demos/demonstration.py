@@ -137,9 +137,9 @@ def _differences(spec: BehaviorSpec, wanted: BehaviorSpec, whose: str) -> list[s
     size, other_size = spec.action_spec.continuous_size, wanted.action_spec.continuous_size
     if size != other_size:
         found.append(f"actions have {size} continuous columns, {whose} have {other_size}")
-    branches, others = (tuple(map(int, side.action_spec.discrete_branches)) for side in (spec, wanted))
-    if branches != others:
-        found.append(f"discrete branches have sizes {branches}, {whose} have {others}")
+    sizes, other_sizes = (tuple(map(int, side.action_spec.discrete_branches)) for side in (spec, wanted))
+    if sizes != other_sizes:
+        found.append(f"discrete branches have sizes {sizes}, {whose} have {other_sizes}")
     return found
 
 

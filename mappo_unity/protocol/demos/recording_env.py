@@ -152,7 +152,7 @@ def recording_files(path: Path, behaviors: Iterable[str]) -> dict[str, Path]:
         files = " and ".join(f"{keys.file_stem(name)}{SUFFIX}" for name in names)
         raise ConfigError(
             f"recording {path} would be of several behaviors, but a file is of one: name a folder, such as "
-            f"{path.with_suffix('')}, for {files}"
+            f"{path.with_suffix('')}{os.sep}, for {files}"
         )
 
     files_of = {name: path if is_file else path / f"{keys.file_stem(name)}{SUFFIX}" for name in names}
