@@ -174,6 +174,20 @@ def test_unity_since_1_5_does_not_record_the_last_action_of_an_episode(tmp_path:
 def test_a_file_without_the_tail_is_not_shifted(tmp_path: Path) -> None:
     unity_file(tmp_path / "run.demo", [1, 2, 3, 0, 4, 0], END, tail=False)
     assert read_demo(tmp_path / "run.demo").discrete[:, 0].tolist() == [1, 2, 3, 4]
+    with (tmp_path / "run.demo").open("ab") as file:
+        file.write(b"something else")
+    assert read_demo(tmp_path / "run.demo").discrete[:, 0].tolist() == [1, 2, 3, 4]
+
+
+def test_an_agent_that_others_interrupt_is_not_paired_with_them(tmp_path: Path) -> None:
+    path = tmp_path / "run.demo"
+    unity_file(path, [1, 2, 3, 4], [False] * 4, tail=False)
+    data = path.read_bytes()
+    assert data.count(b"\x50\x07") == 4  # field 10, the agent's id
+    halves = data.rsplit(b"\x50\x07", 2)
+    path.write_bytes(b"\x50\x08".join(halves))
+    demo = read_demo(path)
+    assert demo.discrete[:, 0].tolist() == [1, 3] and demo.first.all() and not demo.done.any()
 
 
 def change(content: bytes, at: int, by: bytes) -> bytes:

@@ -57,8 +57,8 @@ def parse(data: bytes, path: Path) -> DemoFile:
     records: list[Any] = []
     count = 0
     try:
-        header, _ = _delimited(data[:BEHAVIOR_AT], 0)
-        meta = DemonstrationMetaProto.FromString(header)
+        head, _ = _delimited(data[:BEHAVIOR_AT], 0)
+        meta = DemonstrationMetaProto.FromString(head)
         if meta.api_version not in READABLE_VERSIONS:
             raise ConfigError(
                 f"demonstration {path} has version {meta.api_version}; the versions that can be read are "
@@ -82,7 +82,7 @@ def parse(data: bytes, path: Path) -> DemoFile:
 
     if not records:
         raise ConfigError(f"demonstration {path} has no records: was the recording not ended properly?")
-    return DemoFile(behavior, records, at < len(data))
+    return DemoFile(behavior, records, data[at:] == head)
 
 
 def header(name: str, records: int, episodes: int, mean_return: float) -> bytes:

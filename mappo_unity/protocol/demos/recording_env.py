@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,11 +79,11 @@ class RecordingEnv(BaseEnv):
         try:
             self._record()
         finally:
-            try:
+            # whatever fails, the rest is still done
+            with ExitStack() as stack:
+                stack.callback(self._env.close)
                 for writer in self._writers.values():
-                    writer.close()
-            finally:
-                self._env.close()
+                    stack.callback(writer.close)
 
     def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
         """Hand the actions of a behavior's agents on."""
