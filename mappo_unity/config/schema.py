@@ -600,8 +600,7 @@ class Config:
         _at_least("max_jobs", self.max_jobs, 1)
         _rule("stop_at_return", self.stop_at_return, True, "must be a finite number or null")
 
-        kind, _, index = self.device.partition(":")
-        if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
+        if not re.fullmatch(r"cpu|cuda(:[0-9]+)?", self.device):
             raise ConfigError(f"device={self.device!r} must be one of cpu, cuda, cuda:N")
 
 

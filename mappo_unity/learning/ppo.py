@@ -292,7 +292,7 @@ class PolicyLearner:
         self._load_trainable(state)
         self.value_norm.load_state_dict(by_stream(state["value_norm"]))
         self.rewards.load_state_dict(state.get("rewards", {}))
-        self.carried.load_state_dict(state.get("carried"))
+        self.carried.load_state_dict(state.get("carried"), self.params[0].device)
         self.reader.load_state_dict(state.get("critic_states", {}))
         self.rollbacks = int(state["rollbacks"])
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2
