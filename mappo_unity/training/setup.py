@@ -20,9 +20,12 @@ from torchrl.envs import EnvBase, ExplorationType
 from mappo_unity.config.per_behavior import behavior_config, check_behaviors
 from mappo_unity.config.schema import CollectConfig, Config, CriticKind, ModelConfig, PPOConfig
 from mappo_unity.envs.backends import make_env_function
+from mappo_unity.envs.replay import make_replay_function, read_fitting
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
+from mappo_unity.learning.imitation.cloning import Cloning
+from mappo_unity.learning.imitation.expert import make_expert
 from mappo_unity.learning.networks.actor_critic import JointPolicy, make_actor, make_critic
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
@@ -144,8 +147,9 @@ def check_device(device: str) -> None:
 
 def make_unity_env(cfg: Config, folder: Path) -> UnityEnv:
     """Open the environment of the options behind the adapter; players log below the run's folder."""
+    make_env = make_replay_function(cfg) if cfg.bc.only else make_env_function(cfg.env, folder / PLAYERS)
     return UnityEnv(
-        make_env_function(cfg.env, folder / PLAYERS),
+        make_env,
         cfg.seed,
         action_limit=CONTINUOUS_LIMIT,
         max_team_size=cfg.env.max_team_size,
@@ -205,7 +209,7 @@ def make_learners(
 
     learners = {}
     for name, sides in env.sides.items():
-        model, ppo, rewards = behavior_config(cfg, name)
+        model, ppo, rewards, bc = behavior_config(cfg, name)
         behavior = env.behaviors[sides[0]]
         # sides that share a policy are stacked: all their teams are rows of its batch
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
@@ -221,11 +225,19 @@ def make_learners(
 
         # Built after the check, so that what does not fit is refused by a line of ours.
         actor = make_actor(obs, layout, team_size, model).to(cfg.device)
-        intrinsic = make_intrinsic(obs, layout, rewards, cfg.device)
+        cloned, judged = (
+            make_expert(read_fitting(demos, behavior.spec, name), obs.keys, cfg.device) if demos else None
+            for demos in (bc.demos, rewards.gail.demos if rewards.gail.strength else [])
+        )
+        intrinsic = make_intrinsic(obs, layout, rewards, cfg.device, judged)
         critic = make_critic(obs, team_size, model, layout, 1 + len(intrinsic)).to(cfg.device)
         shares = model.critic is CriticKind.poca and team_size > 1
         streams = RewardStreams(ppo, rewards, intrinsic, obs.keys, shares)
-        learners[name] = PolicyLearner(actor, critic, ppo, streams)
+        cloning = None
+        if cloned is not None:
+            share = bc.steps / cfg.max_steps if bc.steps else None
+            cloning = Cloning(actor, cloned, bc, ppo, share)
+        learners[name] = PolicyLearner(actor, critic, ppo, streams, cloning)
 
     return learners
 
