@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mlagents_envs.side_channel import IncomingMessage
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.parameters.curriculum import Completion, Lesson, read_curriculum
@@ -69,10 +68,13 @@ def completed(**completion: Any) -> dict[str, Any]:
         (float("nan"), "env.params.x=nan must be finite"),
         ({}, "env.params.x={} must be a number, a sampler {sampler: ...} or a curriculum {lessons: [...]}"),
         ({"samplr": "uniform"}, "must be a number, a sampler"),
-        ({"sampler": "unifrom"}, "x.sampler=unifrom does not exist (did you mean uniform?); choices: uniform,"),
+        (
+            {"sampler": "unifrom"},
+            "x.sampler=unifrom does not exist (did you mean uniform?); choices: uniform,",
+        ),
         ({"sampler": None}, "names no sampler: write {sampler: uniform, min: 0.5, max: 10}"),
         ({"sampler": ["uniform"]}, "env.params.x.sampler=[uniform] does not exist"),
-        (UNIFORM | {"mx": 2}, "env.params.x.mx: there is no such key (did you mean max or min?)"),
+        (UNIFORM | {"mx": 2}, "env.params.x.mx: there is no such key (did you mean max?)"),
         (UNIFORM | {"min": 11}, "env.params.x.min=11 must not be above max=10"),
         (UNIFORM | {"max": float("inf")}, "env.params.x.max=inf must be finite"),
         (UNIFORM | {"max": "ten"}, "env.params.x.max=ten must be a number"),
@@ -80,7 +82,10 @@ def completed(**completion: Any) -> dict[str, Any]:
         (UNIFORM | {"seed": -2}, "env.params.x.seed=-2 must be a whole number"),
         ({"sampler": "gaussian", "st_dev": -1}, "env.params.x.st_dev=-1 is out of range: it must be >= 0"),
         ({"sampler": "gaussian", "min": 0}, "env.params.x.min: there is no such key"),
-        ({"sampler": "multirangeuniform", "intervals": [1, 2]}, "intervals=[1,2] must be a list of intervals"),
+        (
+            {"sampler": "multirangeuniform", "intervals": [1, 2]},
+            "intervals=[1,2] must be a list of intervals",
+        ),
         ({"sampler": "multirangeuniform", "intervals": []}, "intervals=[] must be a list of intervals"),
         ({"sampler": "multirangeuniform", "intervals": [[1]]}, "must be a list of intervals [min, max]"),
         (
@@ -96,9 +101,15 @@ def completed(**completion: Any) -> dict[str, Any]:
         (lessons({"name": "a"}), "env.params.x.lessons[0] has no value"),
         (lessons({"value": 1, "nme": "a"}), "env.params.x.lessons[0].nme: there is no such key"),
         (lessons({"value": 1, "name": [1]}), "env.params.x.lessons[0].name=[1] must be a text"),
-        (lessons({"value": 1}, {"value": 2}), "lessons[0] has no completion, which every lesson but the last"),
+        (
+            lessons({"value": 1}, {"value": 2}),
+            "lessons[0] has no completion, which every lesson but the last",
+        ),
         (lessons({"value": {"sampler": "x"}}), "env.params.x.lessons[0].value.sampler=x does not exist"),
-        (completed(measure="rewards"), "completion.measure=rewards does not exist; choices: progress, reward"),
+        (
+            completed(measure="rewards"),
+            "completion.measure=rewards does not exist; choices: progress, reward",
+        ),
         (completed(measure="progress", threshold=1.5), "completion.threshold=1.5 is out of range"),
         (completed(measure="progress", threshold=-0.1), "it must be from 0 to 1"),
         (completed(threshold=float("nan")), "completion.threshold=nan must be finite"),
@@ -126,7 +137,10 @@ def test_a_curriculum_is_read_in_our_words_and_in_those_of_ml_agents() -> None:
         "curriculum": [
             {
                 "name": "easy",
-                "value": {"sampler_type": "uniform", "sampler_parameters": {"min_value": 0.5, "max_value": 10}},
+                "value": {
+                    "sampler_type": "uniform",
+                    "sampler_parameters": {"min_value": 0.5, "max_value": 10},
+                },
                 "completion_criteria": {"behavior": "B", **DONE, "min_lesson_length": 5},
             },
             {"value": 8},
@@ -149,14 +163,20 @@ def test_samplers_stand_in_order_and_curricula_at_a_lesson() -> None:
 
     walls["lessons"][1]["value"] = 8
     assert params_at(cfg.params, {})["big_wall_height"] == UNIFORM
-    assert params_at(cfg.params, {"big_wall_height": 1}) == {"small_wall_height": UNIFORM, "big_wall_height": 8}
+    assert params_at(cfg.params, {"big_wall_height": 1}) == {
+        "small_wall_height": UNIFORM,
+        "big_wall_height": 8,
+    }
 
 
 def test_values_are_shown() -> None:
     assert show_parameter(2.0) == "2" and show_parameter(3) == "3"
     assert show_parameter(Sampler("uniform", (0.5, 10.0))) == "uniform 0.5 to 10"
     assert show_parameter(Sampler("gaussian", (2.0, 0.1))) == "gaussian, mean 2, st_dev 0.1"
-    assert show_parameter(Sampler("multirangeuniform", (1.0, 2.0, 5.0, 8.0))) == "multirangeuniform 1 to 2, 5 to 8"
+    assert (
+        show_parameter(Sampler("multirangeuniform", (1.0, 2.0, 5.0, 8.0)))
+        == "multirangeuniform 1 to 2, 5 to 8"
+    )
 
 
 @pytest.mark.parametrize(
@@ -170,8 +190,14 @@ def test_values_are_shown() -> None:
             ["parameters=3DBall_randomize", "env.params.mass={sampler: gaussian, mean: 2}"],
             {"sampler": "gaussian", "mean": 2},
         ),
-        (["parameters=3DBall_randomize", "env.params={mass: {lessons: [{value: 2}]}}"], lessons({"value": 2})),
-        (["env.params.mass={sampler: gaussian}", "env.params.mass={sampler: uniform}"], {"sampler": "uniform"}),
+        (
+            ["parameters=3DBall_randomize", "env.params={mass: {lessons: [{value: 2}]}}"],
+            lessons({"value": 2}),
+        ),
+        (
+            ["env.params.mass={sampler: gaussian}", "env.params.mass={sampler: uniform}"],
+            {"sampler": "uniform"},
+        ),
     ],
 )
 def test_the_command_line_takes_them(lines: list[str], mass: Any) -> None:
@@ -263,7 +289,11 @@ def test_a_gaussian_keeps_to_what_the_scene_can_take() -> None:
         ("mas", Sampler("uniform", (1.0, 2.0)), "scene S has no parameter 'mas'; choices: gravity, mass, x"),
         ("mass", Sampler("uniform", (0.0, 2.0)), "what uniform 0 to 2 draws must be > 0"),
         ("mass", Sampler("gaussian", (-1.0, 2.0)), "what gaussian, mean -1, st_dev 2 draws must be > 0"),
-        ("gravity", Sampler("uniform", (1.0, 2.0)), "acts at once and not at a reset, so it takes no sampler"),
+        (
+            "gravity",
+            Sampler("uniform", (1.0, 2.0)),
+            "acts at once and not at a reset, so it takes no sampler",
+        ),
         ("mass", {"samplr": 1}, "must be a finite number (or, in options, a sampler {sampler: ...}"),
     ],
 )
@@ -319,7 +349,9 @@ def test_a_scene_goes_on_from_a_snapshot_with_the_same_draws() -> None:
 
 
 def test_a_later_lesson_is_checked_when_the_scene_is_opened() -> None:
-    make = make_env_function(EnvConfig(params={"mass": lessons({"value": 1, "completion": DONE}, {"value": -1})}))
+    make = make_env_function(
+        EnvConfig(params={"mass": lessons({"value": 1, "completion": DONE}, {"value": -1})})
+    )
     with pytest.raises(ConfigError, match="parameter mass=-1.0 of scene 3DBall is out of range"):
         make(0)
 
@@ -340,14 +372,14 @@ def test_what_is_sent_to_a_player_arrives(value: Any) -> None:
     channel = side_channels.ParametersChannel()
     channel.send("mass", value, seed=3)
     (message,) = channel.message_queue
-    assert side_channels.read_parameter(IncomingMessage(bytes(message))) == ("mass", value)
+    assert side_channels.read_parameter(side_channels.IncomingMessage(bytes(message))) == ("mass", value)
 
 
 def test_the_players_seed_is_that_of_its_samplers() -> None:
     channel = side_channels.ParametersChannel()
     channel.send("mass", Sampler("uniform", (0.5, 8.0), order=2), seed=3)
     (message,) = channel.message_queue
-    assert side_channels.read_parameter(IncomingMessage(bytes(message)))[1].seed == 5
+    assert side_channels.read_parameter(side_channels.IncomingMessage(bytes(message)))[1].seed == 5
 
 
 def test_our_player_draws_and_says_what_it_ignores() -> None:
@@ -367,4 +399,4 @@ def test_a_sampler_of_no_kind_is_refused() -> None:
     channel.set_uniform_sampler_parameters("mass", 3.0, 1.0, 0)
     (message,) = channel.message_queue
     with pytest.raises(ConfigError, match="environment parameter mass.min=3 must not be above max=1"):
-        side_channels.read_parameter(IncomingMessage(bytes(message)))
+        side_channels.read_parameter(side_channels.IncomingMessage(bytes(message)))

@@ -103,7 +103,6 @@ class TrainingSetup:
         torch.set_num_threads(self.cfg.num_threads)
         return metrics
 
-
     def forget_pending(self) -> None:
         """Drop the decisions whose outcome has not arrived: the environment was reset."""
         for learner in self.learners.values():

@@ -111,7 +111,7 @@ def _sampler(where: str, raw: dict[Any, Any]) -> Value:
     kind = raw.get(SAMPLER)
     if kind is None:
         raise ConfigError(f"{where}={show_value(raw)} names no sampler: write {_EXAMPLE}")
-    if kind not in _DEFAULTS:
+    if not isinstance(kind, str) or kind not in _DEFAULTS:
         hint = did_you_mean(str(kind), _DEFAULTS)
         choices = ", ".join(_DEFAULTS)
         raise ConfigError(f"{where}.sampler={show_value(kind)} does not exist{hint}; choices: {choices}")
