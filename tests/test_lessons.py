@@ -73,8 +73,8 @@ def test_without_smoothing_the_mean_itself_counts_and_group_rewards_do_not() -> 
     raw = two(threshold=5, signal_smoothing=False, min_lesson_length=2)
     lessons = Lessons(parameters(*raw), {"A": 2})
     assert lessons.notes == [
-        "note: env.params.level.lessons[0].completion measures the individual rewards of A, as ML-Agents does; "
-        "what its agents earn as a group does not count"
+        "note: env.params.level.lessons[0].completion measures the individual rewards of A, as ML-Agents "
+        "does; what its agents earn as a group does not count"
     ]
     assert lessons.advance(episodes(4, 6, group=100), 0.0) == []
     assert len(lessons.advance(episodes(7), 0.0)) == 1
@@ -113,7 +113,7 @@ def test_state_goes_on() -> None:
 
     fewer = Lessons(parameters({"value": 5}), {"A": 1})
     assert fewer.load_state_dict(one.state_dict()) == {"level": 5.0} and fewer.numbers == {"level": 0}
-    sampler = Lessons(parameters(name="x", *two(measure="progress"), y={"sampler": "uniform"}), {"A": 1})
+    sampler = Lessons(parameters(*two(measure="progress"), name="x", y={"sampler": "uniform"}), {"A": 1})
     assert sampler.load_state_dict({}) == {"x": 1.0, "y": Sampler("uniform", (0.0, 1.0))}
 
 
@@ -187,9 +187,7 @@ def test_the_goal_waits_for_the_last_lesson(tmp_path: Path) -> None:
 
 def test_an_environment_must_take_parameters_while_it_plays(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.delattr(probes.Level, "set_parameter")
-    with pytest.raises(
-        ConfigError, match="env.params.level has lessons, but the environment's parameters can"
-    ):
+    with pytest.raises(ConfigError, match="env.params.level has lessons, but the environment's param"):
         train(probe({"lessons": two(measure="progress")}), tmp_path)
 
 
@@ -258,7 +256,8 @@ def test_an_evaluation_plays_the_checkpoints_lesson_or_what_it_is_told(tmp_path:
     lines = ["env=3DBall", f"env.num_areas={AREAS}", f"collect.rounds={ROUNDS}", "model.hidden=[8]"]
     lines += ["log.loggers=[]", "export_onnx=false", f"max_steps={2 * BATCH}", f"hydra.run.dir={tmp_path}"]
     done = "{measure: progress, threshold: 0.4}"
-    mass = f"env.params.mass={{lessons: [{{value: 1, completion: {done}}}, {{value: {{sampler: uniform, max: 3, min: 2}}}}]}}"
+    last = "{value: {sampler: uniform, max: 3, min: 2}}"
+    mass = f"env.params.mass={{lessons: [{{value: 1, completion: {done}}}, {last}]}}"
     assert train_main([*lines, f"checkpoint_interval={BATCH}", mass]) == 0
 
     def shown(*options: str) -> Any:

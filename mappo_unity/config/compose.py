@@ -177,7 +177,7 @@ def check_effect(lines: list[str], configs: list[Config]) -> None:
 
 
 def _keep_parameters_whole(tree: DictConfig, lines: list[str]) -> None:
-    """Put a sampler or curriculum of the command line in the place of another, with whose keys Hydra mixes it."""
+    """Put samplers and curricula of the command line in the place of others, whose keys Hydra mixes in."""
     root = "env.params"
     for override in parse(lines):
         key, value = override.key_or_group, override.value()

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from mappo_unity.config.parameters.samplers import Sampler
+from mappo_unity.config.schema import EnvConfig
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.episodes import play, summarize
 from mappo_unity.policies.matches import Score, play_matches
@@ -51,15 +52,7 @@ def evaluate(
     make_env = make_env_function(options)
 
     head = {"policy": str(getattr(policy, "path", run)), "deterministic": deterministic, "seed": seed}
-    head |= (
-        {"agent_steps": policy.agent_steps}
-        if isinstance(policy, (CheckpointPolicy, OnnxPolicy, OnnxFolder))
-        else {}
-    )
-    if options.params:
-        shown = {name: _shown(value) for name, value in options.parameters.items()}
-        head |= {"env.params": shown}
-
+    head |= _more_head(policy, options)
     if opponent is not None:
         other = open_policy(opponent, deterministic, seed, "opponent")
         scores = play_matches(make_env, policy, other, episodes, seed)
@@ -76,8 +69,15 @@ def evaluate(
     return head | (next(iter(behaviors.values())) if len(behaviors) == 1 else {"behaviors": behaviors})
 
 
-def _shown(value: Any) -> Any:
-    return str(value) if isinstance(value, Sampler) else value
+def _more_head(policy: Policy, env: EnvConfig) -> dict[str, Any]:
+    """Return what a policy says of its training, and the environment parameters in force."""
+    head: dict[str, Any] = {}
+    if isinstance(policy, (CheckpointPolicy, OnnxPolicy, OnnxFolder)):
+        head["agent_steps"] = policy.agent_steps
+    if env.params:
+        values = env.parameters.items()
+        head["env.params"] = {n: str(value) if isinstance(value, Sampler) else value for n, value in values}
+    return head
 
 
 def match_figures(scores: dict[str, Score]) -> dict[str, Any]:

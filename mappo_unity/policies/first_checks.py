@@ -34,7 +34,7 @@ _FILE_ENDING = re.compile(rf"\.(?!{SUFFIX[1:]}$)[A-Za-z][A-Za-z0-9]{{0,3}}")
 
 
 def check_evaluation(cfg: EvalConfig, params: Sequence[str] = ()) -> None:
-    """Raise ConfigError if nothing can be evaluated with these options, and lines such as env.params.mass=2."""
+    """Raise ConfigError if nothing can be evaluated with these options; `params`: see `config_to_play`."""
     check_mujoco()
     sources = [locate(cfg.run, "run")]
     if cfg.opponent is not None:

@@ -64,7 +64,7 @@ class MatchSeries:
     def play(
         self, env: EnvConfig, agent_steps: int, layout: dict[str, Any], actors: dict[str, UnityActor]
     ) -> dict[str, float]:
-        """Play a series in an environment, and return its figures; training's random numbers stay untouched."""
+        """Play a series and return its figures; the random numbers of training stay untouched."""
         cfg = self._cfg
         policy = ActorPolicy(layout, actors, False, "the policy")
         # `torch.manual_seed` seeds the GPU, too, where the policy draws its actions

@@ -115,8 +115,8 @@ def make_lessons(cfg: Config, env: UnityEnv) -> Lessons:
     lessons = Lessons(cfg.env.parameters, sizes)
     if lessons.numbers and not env.takes_parameters:
         raise ConfigError(
-            f"env.params.{next(iter(lessons.numbers))} has lessons, but the environment's parameters cannot be "
-            "set while it plays: it needs a method set_parameter(name, value)"
+            f"env.params.{next(iter(lessons.numbers))} has lessons, but the environment's parameters cannot "
+            "be set while it plays: it needs a method set_parameter(name, value)"
         )
     return lessons
 

@@ -1,1 +1,1 @@
-"""Values of environment parameters, as options write them: numbers, samplers and curricula; loads no torch."""
+"""Values of environment parameters as options write them: numbers, samplers, curricula; loads no torch."""

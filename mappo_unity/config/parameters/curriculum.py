@@ -32,7 +32,7 @@ class Completion:
     behavior: str | None
     """Policy name whose episodes count; None: the only one there is."""
     measure: str
-    """PROGRESS: the share of the run's max_steps that are done; REWARD: the mean return of recent episodes."""
+    """PROGRESS: the share of the run's max_steps that is done; REWARD: the mean return of new episodes."""
     threshold: float
     """What the measure must be above."""
     min_lesson_length: int
