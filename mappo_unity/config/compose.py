@@ -180,7 +180,8 @@ def _keep_parameters_whole(tree: DictConfig, lines: list[str]) -> None:
     """Put samplers and curricula of the command line in the place of others, whose keys Hydra mixes in."""
     root = "env.params"
     for override in parse(lines):
-        key, value = override.key_or_group, override.value()
+        key = override.key_or_group
+        value: Any = override.value()
         if override.is_delete() or key != root and not key.startswith(f"{root}."):
             continue
 
