@@ -32,7 +32,7 @@ from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.scenes.contract.images import looks_unmarked
 from mappo_unity.training.batches import Batch, BatchCollector, count_present
-from mappo_unity.training.lessons.curriculum import Lessons
+from mappo_unity.training.lessons.curriculum import lessons_of
 from mappo_unity.training.memory import check_free, show_size
 
 BATCH_COPIES = 6
@@ -60,7 +60,7 @@ class TrainingSetup:
     def __init__(self, cfg: Config, env: UnityEnv) -> None:
         self.cfg, self.env = cfg, env
         self.notes = [f"note: {cfg.env.note}"] if cfg.env.note is not None else []
-        self.lessons = make_lessons(cfg, env)
+        self.lessons = lessons_of(cfg.env, env)
         self.notes += self.lessons.notes
 
         self.guesses_channels = False
@@ -107,18 +107,6 @@ class TrainingSetup:
         """Drop the decisions whose outcome has not arrived: the environment was reset."""
         for learner in self.learners.values():
             learner.carried.rounds = None
-
-
-def make_lessons(cfg: Config, env: UnityEnv) -> Lessons:
-    """Return the lessons of the options; raise ConfigError where the environment does not fit them."""
-    sizes = {name: env.behaviors[sides[0]].slots.team_size for name, sides in env.sides.items()}
-    lessons = Lessons(cfg.env.parameters, sizes)
-    if lessons.numbers and not env.takes_parameters:
-        raise ConfigError(
-            f"env.params.{next(iter(lessons.numbers))} has lessons, but the environment's parameters cannot "
-            "be set while it plays: it needs a method set_parameter(name, value)"
-        )
-    return lessons
 
 
 @contextmanager

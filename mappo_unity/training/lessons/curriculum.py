@@ -18,7 +18,9 @@ from mappo_unity import keys
 from mappo_unity.config.parameters.curriculum import PROGRESS, REWARD, Completion, Lesson
 from mappo_unity.config.parameters.samplers import Sampler, Value
 from mappo_unity.config.parameters.values import curricula, show_parameter, values_at
+from mappo_unity.config.schema import EnvConfig
 from mappo_unity.envs.returns import Episode
+from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
 
 KEPT = 0.25
@@ -207,3 +209,15 @@ class Lessons:
                     f"note: {where} measures the individual rewards of {policy}, as ML-Agents does; what its "
                     "agents earn as a group does not count"
                 )
+
+
+def lessons_of(cfg: EnvConfig, env: UnityEnv) -> Lessons:
+    """Return the lessons of the options; raise ConfigError where the environment does not fit them."""
+    sizes = {name: env.behaviors[sides[0]].slots.team_size for name, sides in env.sides.items()}
+    lessons = Lessons(cfg.parameters, sizes)
+    if lessons.numbers and not env.takes_parameters:
+        raise ConfigError(
+            f"env.params.{next(iter(lessons.numbers))} has lessons, but the environment's parameters cannot "
+            "be set while it plays: it needs a method set_parameter(name, value)"
+        )
+    return lessons
