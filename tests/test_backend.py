@@ -667,7 +667,7 @@ class TestOptions:
             ({"screen_width": 80}, "env.screen_width and env.screen_height belong together"),
             (
                 {"backend": Backend.editor, "params": {"mass": "big"}},
-                "env.params.mass='big' must be a number",
+                "env.params.mass=big must be a number, a sampler",
             ),
         ],
     )

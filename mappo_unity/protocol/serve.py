@@ -29,7 +29,6 @@ from mappo_unity.config.parameters.values import show_parameter  # noqa: E402
 from mappo_unity.protocol import encode, messages, side_channels  # noqa: E402
 from mappo_unity.protocol.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
 from mappo_unity.protocol.ports import EDITOR_PORT  # noqa: E402
-from mappo_unity.scenes.core.scene import Scene  # noqa: E402
 
 CONNECT_TIMEOUT_S = 60.0
 """How long a player looks for its trainer."""
@@ -255,6 +254,8 @@ class Player:
                 self.log(f"a message on side channel {channel}, which this player does not know")
 
     def _set_parameter(self, name: str, value: Value) -> None:
+        from mappo_unity.scenes.core.scene import Scene
+
         setter = getattr(self.env, "set_parameter", None)
         shown = show_parameter(value)
         try:
