@@ -19,6 +19,7 @@ from mappo_unity.protocol.serve import Player
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.core.parameters import Parameters, draw
 from mappo_unity.scenes.core.specs import Parameter
+from mappo_unity.training.plan import plan_jobs
 
 UNIFORM = {"sampler": "uniform", "min": 0.5, "max": 10}
 DONE = {"measure": "progress", "threshold": 0.1}
@@ -400,3 +401,8 @@ def test_a_sampler_of_no_kind_is_refused() -> None:
     (message,) = channel.message_queue
     with pytest.raises(ConfigError, match="environment parameter mass.min=3 must not be above max=1"):
         side_channels.read_parameter(side_channels.IncomingMessage(bytes(message)))
+
+
+def test_a_sweep_takes_them() -> None:
+    lines = ["env=3DBall", "parameters=3DBall_randomize", "env.params.mass={sampler: gaussian},3"]
+    assert [c.env.params["mass"] for c in plan_jobs(lines).configs] == [{"sampler": "gaussian"}, 3]
