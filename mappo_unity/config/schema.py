@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Optional
 
+from mappo_unity.config.parameters.values import FACTORY, PLAYERS, SCENE, read_parameters
 from mappo_unity.errors import ConfigError
 
 
@@ -145,7 +146,8 @@ class EnvConfig:
     num_areas: Optional[int] = field(default=None, metadata=_ANY_BUT_CUSTOM)
     """Copies of the playing area inside one environment; null: as many as the Unity scene has."""
     params: dict[str, Any] = field(default_factory=dict)
-    """Environment parameters (env.params.mass=2) of the scene or player, or arguments of env.factory."""
+    """Environment parameters (env.params.mass=2) of the scene or player, or arguments of env.factory. Also a
+    sampler, {sampler: uniform, min: 0.5, max: 10}, or a curriculum, {lessons: [...]}."""
     factory: Optional[str] = field(default=None, metadata={BACKENDS: (Backend.custom,)})
     """With backend=custom: package.module:function, called as function(seed=..., **env.params)."""
     file_name: Optional[str] = field(default=None, metadata={BACKENDS: (Backend.player,)})
@@ -206,6 +208,7 @@ class EnvConfig:
             _within("env.port", self.port, 1, 65535)
 
         self._check_players()
+        _ = self.parameters  # which looks for mistakes
 
         if self.backend is Backend.custom and not self.factory:
             raise ConfigError(
@@ -232,12 +235,11 @@ class EnvConfig:
                 f"env.backend={self.backend.value} there is one environment{larger}"
             )
 
-        if self.backend in (Backend.player, Backend.editor, Backend.registry):
-            for name, value in self.params.items():
-                if isinstance(value, bool) or not isinstance(value, (int, float)):
-                    raise ConfigError(
-                        f"env.params.{name}={value!r} must be a number: players take float parameters only"
-                    )
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What env.params says, read: see `read_parameters`; raises ConfigError."""
+        takers = {Backend.embedded: SCENE, Backend.custom: FACTORY}
+        return read_parameters(self.params, takers.get(self.backend, PLAYERS))
 
 
 LOG_STD_RANGE = (-5, 2)

@@ -36,6 +36,7 @@ from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.scenes.contract.images import looks_unmarked
 from mappo_unity.training.batches import Batch, BatchCollector, count_present
+from mappo_unity.training.lessons.curriculum import lessons_of
 from mappo_unity.training.memory import check_free, show_size
 
 BATCH_COPIES = 6
@@ -53,8 +54,8 @@ class TrainingSetup:
         cfg: the run's options.
         env: the environment, open.
 
-    Attributes: `learners` by policy name; `policy`, their actors as one; `rounds` of a batch; `notes`, lines
-    for the user; `guesses_channels`, whether `guess_channels` built the networks.
+    Attributes: `learners` by policy name; `policy`, their actors as one; `lessons` of environment parameters;
+    `notes`, lines for the user; `guesses_channels`, whether `guess_channels` built the networks.
 
     Raises:
         ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
@@ -63,6 +64,8 @@ class TrainingSetup:
     def __init__(self, cfg: Config, env: UnityEnv) -> None:
         self.cfg, self.env = cfg, env
         self.notes = [f"note: {cfg.env.note}"] if cfg.env.note is not None else []
+        self.lessons = lessons_of(cfg.env, env)
+        self.notes += self.lessons.notes
 
         self.guesses_channels = False
         self._make_learners(self.notes.append)
@@ -103,6 +106,11 @@ class TrainingSetup:
             metrics[name] = learner.learn(batch.of(name), progress)
         torch.set_num_threads(self.cfg.num_threads)
         return metrics
+
+    def forget_pending(self) -> None:
+        """Drop the decisions whose outcome has not arrived: the environment was reset."""
+        for learner in self.learners.values():
+            learner.carried.rounds = None
 
 
 @contextmanager
