@@ -67,18 +67,19 @@ class PolicyLearner:
         self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
 
-    def learn(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+    def learn(self, batch: TensorDictBase, following: TensorDictBase, progress: float) -> dict[str, float]:
         """Improve the networks by one batch.
 
         Args:
-            batch: ``[T, ..., A]`` entries of this policy name, as collected.
+            batch: ``[T, ..., A]`` entries of this policy name, as collected; ``next`` holds rewards and ends.
+            following: what was seen after them, see `keys.FINAL`, `keys.CUT_OFF` and `keys.CUT_OFF_AT`.
             progress: share of the run that is over, 0 to 1, for the schedules.
 
         Returns:
             Metrics.
         """
         settings = self._set_schedules(progress)
-        buffer, metrics = self.prepare(batch)
+        buffer, metrics = self.prepare(batch, following)
         metrics |= self.update(buffer) if buffer is not None else {}
         self._update_norms(batch)
         return metrics | settings
@@ -100,14 +101,15 @@ class PolicyLearner:
         return {"lr": lr, "clip_epsilon": clip, "entropy_coef": entropy}
 
     @torch.no_grad()
-    def prepare(self, batch: TensorDictBase) -> tuple[ReplayBuffer | None, dict[str, float]]:
+    def prepare(
+        self, batch: TensorDictBase, following: TensorDictBase
+    ) -> tuple[ReplayBuffer | None, dict[str, float]]:
         """Add advantages and targets; return a buffer of the rows that are learnt, None if there are none."""
-        following = batch.get("next")
         rounds = self.carried.join(batch)
         values = self.reader.read(rounds, following)
 
         ended = rounds.get(keys.TERMINATED) | rounds.get(keys.TRUNCATED)
-        view = make_view(rounds.get(VALUED), has_value(following[-1]), ended)
+        view = make_view(rounds.get(VALUED), has_value(following.get(keys.FINAL)), ended)
         gae = estimate(
             view,
             self._rewards(rounds),

@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase, ExplorationType
 from mappo_unity.config.per_behavior import behavior_config, check_behaviors
 from mappo_unity.config.schema import CollectConfig, Config, ModelConfig, PPOConfig
 from mappo_unity.envs.backends import make_env_function
-from mappo_unity.envs.transforms import transformed
+from mappo_unity.envs.following import followed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.actor_critic import JointPolicy, make_actor, make_critic
@@ -76,7 +76,7 @@ class TrainingSetup:
     @contextmanager
     def collecting(self) -> Iterator[BatchCollector]:
         """Yield endless batches, collected from where the environment stands."""
-        collector = make_collector(transformed(self.env), self.policy, device=self.cfg.device)
+        collector = make_collector(followed(self.env), self.policy, device=self.cfg.device)
         try:
             yield BatchCollector(collector, self.env, self.cfg.collect)
         finally:
@@ -96,7 +96,7 @@ class TrainingSetup:
         for name, learner in self.learners.items():
             if name in batch.void:
                 learner.carried.void(batch.void[name])
-            metrics[name] = learner.learn(batch.of(name), progress)
+            metrics[name] = learner.learn(*batch.of(name), progress)
         torch.set_num_threads(self.cfg.num_threads)
         return metrics
 
