@@ -13,7 +13,7 @@ for a policy with several.
 """
 
 OBS = "observation"  # float32 [..., A, O]: vector sensors, concatenated in the order of the specs
-SENSOR = "obs_{}"  # float32 [..., A, *sensor shape]: sensor i before concatenation
+SENSOR = "obs_{}"  # [..., A, *sensor shape]: sensor i before concatenation; float32, uint8 of a `ByteImage`
 ACTION = "action"  # see models.ActionLayout
 LOG_PROB = "action_log_prob"  # float32 [..., A]
 LOG_PROBS = "action_log_probs"  # float32 [..., A, C + K]: of each component, where ppo.ratio=component
