@@ -2,8 +2,8 @@
 """Measure what a batch takes in memory, and what collecting and learning it takes at most.
 
 Each scene's preset runs in a process of its own: two iterations, of which the second holds what the first
-left pending. Peaks are resident sets, less what was resident before the first round; the checkpoint is what
-a training run writes.
+left pending. Peaks are resident sets, less what was resident before the first round: of collecting the first
+batch, and of all. The checkpoint is what a training run writes.
 
     python scripts/bench_batch_memory.py [GridFoodCollector SoccerTwos]
 """
@@ -45,11 +45,11 @@ def measure(scene: str) -> None:
     """Print what one scene's preset takes."""
     cfg = compose_config([f"env={scene}", "log.loggers=[]"]).config
     with tempfile.TemporaryDirectory() as out, set_up(cfg, Path(out)) as setup, setup.collecting() as batches:
-        state, before = RunState(cfg, Path(out), setup), peak()
+        state, before, collected = RunState(cfg, Path(out), setup), peak(), None
         for _ in range(ITERATIONS):
             batch = next(batches)
             size = batch.rounds.bytes() + sum(part.bytes() for part in batch.following.values())
-            collected = peak()
+            collected = collected or peak()
             setup.learn(batch, 0.0)
             state.count(batch, collect_s=1.0, update_s=1.0)
             del batch

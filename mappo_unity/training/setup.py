@@ -34,9 +34,9 @@ from mappo_unity.scenes.contract.images import looks_unmarked
 from mappo_unity.training.batches import Batch, BatchCollector, count_present
 from mappo_unity.training.memory import check_free, show_size
 
-BATCH_COPIES = 6
-"""Memory of a batch in units of its observations: as they were and as next ones, as rounds and as a stack of
-them, and the rows that are learnt with what the networks make of them."""
+BATCH_COPIES = 4
+"""Memory of a batch in units of its observations: as collected, behind the rounds that are carried, the rows
+that are learnt, and what the networks make of them."""
 WEIGHT_COPIES = 10
 """Memory of learning in units of the weights: gradients, two moments of Adam, and two copies of weights and
 moments, to roll an update back and to save the last complete iteration."""
@@ -250,9 +250,12 @@ def check_batch_memory(cfg: Config, env: UnityEnv, rounds: int) -> None:
     """Raise ConfigError if a batch does not fit into the memory that is free."""
     option = "batch_size" if cfg.collect.rounds is None else "rounds"
     value = getattr(cfg.collect, option)
-    one_round = env.root().bytes()
+    root = env.root()
+    one_round = root.bytes()
+    # the critic reads all images at once, and as floats
+    as_floats = sum(4 * entry.nbytes for entry in root.values(True, True) if entry.dtype == torch.uint8)
     check_free(
-        BATCH_COPIES * one_round * rounds,
+        (BATCH_COPIES * one_round + as_floats) * rounds,
         f"collect.{option}={value}: learning from a batch of {rounds:,} rounds of {show_size(one_round)}",
         f"lower collect.{option}, or env.num_areas where the environment has it",
     )

@@ -149,7 +149,7 @@ def in_floats(image: Tensor) -> Tensor:
     if image.dtype != torch.uint8:
         return image
     # by a tensor: on a GPU a division by a number is a multiplication, whose last bit may differ
-    return image.float() / torch.full((), 255.0, device=image.device)
+    return image.float().div_(torch.full((), 255.0, device=image.device))
 
 
 def in_type(image: Tensor, dtype: torch.dtype) -> Tensor:
