@@ -29,6 +29,10 @@ def followed(env: UnityEnv) -> FollowedEnv:
 class FollowedEnv(TransformedUnityEnv):
     """A `TransformedUnityEnv` whose ``next`` holds rewards and ends; `pop_following` returns the rest."""
 
+    _last: TensorDictBase  # `next` of the last round, whole
+    _cut_off: dict[str, list[tuple[torch.Tensor, TensorDictBase]]]  # team rows by policy name, and where
+    _rounds: int  # since `pop_following`
+
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._forget()
@@ -70,9 +74,7 @@ class FollowedEnv(TransformedUnityEnv):
         return out
 
     def _forget(self) -> None:
-        self._last: TensorDictBase = TensorDict()
-        self._cut_off: dict[str, list[tuple[torch.Tensor, TensorDictBase]]] = {}
-        self._rounds = 0  # since `pop_following`
+        self._last, self._cut_off, self._rounds = TensorDict(), {}, 0
 
     def _note_cut_off(self, name: str, entries: TensorDictBase) -> None:
         cut_off = entries.get(keys.TRUNCATED).flatten(0, -3).any(-2).squeeze(-1)  # [teams]
