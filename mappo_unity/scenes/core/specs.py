@@ -20,6 +20,7 @@ from mlagents_envs.base_env import (
 )
 
 from mappo_unity.errors import ConfigError
+from mappo_unity.scenes.contract.images import ByteImage
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,16 @@ class Sensor:
     """Frames shown at once, concatenated along the first axis, oldest first."""
     dimension_property: tuple[DimensionProperty, ...] | None = None
     """One flag a dimension; None: NONE for every dimension."""
+    in_bytes: bool = False
+    """Whether every number is k / 255 for a byte k, as in a picture or a grid of 0 and 1: see `ByteImage`."""
 
     def spec(self) -> ObservationSpec:
         """Return the sensor as ML-Agents shows it, stacking included."""
         shape = (self.shape[0] * self.stack, *self.shape[1:])
         flags = self.dimension_property or (DimensionProperty.NONE,) * len(shape)
         name = self.name if self.stack == 1 else f"StackingSensor_size{self.stack}_{self.name}"
-        return ObservationSpec(shape, flags, ObservationType.DEFAULT, name)
+        kind = ByteImage if self.in_bytes else ObservationSpec
+        return kind(shape, flags, ObservationType.DEFAULT, name)
 
 
 @dataclass(frozen=True)
