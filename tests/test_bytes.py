@@ -97,7 +97,7 @@ def test_what_older_versions_hold_as_floats_goes_on_as_bytes(tmp_path: Path) -> 
         rounds, _ = next(batches).of("GridFoodCollector")
         older: dict[str, Any] = {str(k): v.clone() for k, v in learner.carried.join(rounds)[:1].items()}
         older["obs_0"] = in_floats(older["obs_0"])
-        learner.carried.load_state_dict(older)
+        learner.carried.load_state_dict(older, torch.device("cpu"))
         joined = learner.carried.join(rounds).get("obs_0")
         assert joined.dtype == torch.uint8 and torch.equal(joined[0], rounds.get("obs_0")[0])
 
