@@ -37,14 +37,16 @@ class Sensor:
     stack: int = 1
     """Frames shown at once, concatenated along the first axis, oldest first."""
     dimension_property: tuple[DimensionProperty, ...] | None = None
-    """One flag a dimension; None: NONE for every dimension."""
+    """One flag a dimension; None: NONE for every dimension. Rows of varying number: (VARIABLE_SIZE, NONE)."""
+    observation_type: ObservationType = ObservationType.DEFAULT
+    """What is observed, or a goal signal."""
 
     def spec(self) -> ObservationSpec:
         """Return the sensor as ML-Agents shows it, stacking included."""
         shape = (self.shape[0] * self.stack, *self.shape[1:])
         flags = self.dimension_property or (DimensionProperty.NONE,) * len(shape)
         name = self.name if self.stack == 1 else f"StackingSensor_size{self.stack}_{self.name}"
-        return ObservationSpec(shape, flags, ObservationType.DEFAULT, name)
+        return ObservationSpec(shape, flags, self.observation_type, name)
 
 
 @dataclass(frozen=True)
