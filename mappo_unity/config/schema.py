@@ -299,12 +299,12 @@ class ModelConfig:
     """Continuous actions: a Gaussian that the environment clips, its deviation a weight of its own
     (gaussian), or a Gaussian squashed by tanh, its deviation an output of the network (tanh_normal)."""
     image_encoder: ImageKind = ImageKind.auto
-    """Encoder of images and grids: ML-Agents' simple (from 20 x 20 on), nature (36), resnet (15), match3 (5) or
-    dense (any size), with as many features as the first hidden layer; auto: as simple, below 20 x 20 smaller
-    convolutions, with 128 features."""
+    """Encoder of images and grids: ML-Agents' simple (from 20 x 20 on), nature (36), resnet (15), match3 (5)
+    or dense (any size), with as many features as the first hidden layer; auto: convolutions that fit the size,
+    with 128 features."""
     goal_conditioning: GoalKind = GoalKind.none
-    """Sensors that are goal signals: observations like others (none), or besides them what a network makes the
-    weights of the last hidden layer of (hyper: ML-Agents' default; actors and local critics)."""
+    """Sensors that are goal signals: observations like others (none), and, as ML-Agents' default has it, what
+    another network makes the weights of the last hidden layer of (hyper; actors and local critics)."""
     memory: MemoryKind = MemoryKind.none
     """Memory of the actor and the critic: lstm or gru, one layer before the heads; none: they see the newest
     observation only."""

@@ -71,8 +71,8 @@ class ObsLayout:
 
             if len(shape) not in (2, 3):
                 raise ConfigError(
-                    f"sensor obs_{index} has shape {tuple(shape)}; vectors (1 dimension), entities of varying "
-                    "number (2) and images or grids (3) can be learned from"
+                    f"sensor obs_{index} has shape {tuple(shape)}; vectors (1 dimension), entities of "
+                    "varying number (2) and images or grids (3) can be learned from"
                 )
             (sets if len(shape) == 2 else images).append((key, tuple(shape)))
             goal_keys += [key] if is_goal else []
