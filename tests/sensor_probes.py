@@ -23,12 +23,12 @@ def sensor(name: str, *shape: int, goal: bool = False) -> ObservationSpec:
 
 
 class Largest(Probe):
-    """Up to eight entities in two sensors: the reward is the choice, times the colour of the largest one.
+    """Up to five entities in two sensors: the reward is the choice, times the colour of the largest one.
 
     An entity is its size (0.1 to 1) and its colour (+1 or -1). Nobody there: nothing to earn.
     """
 
-    SIZES = (5, 3)
+    SIZES = (3, 2)
 
     def sensor_specs(self):
         return [sensor(f"entities {size}", size, 2) for size in self.SIZES]
@@ -59,7 +59,7 @@ class LargestTeam(Largest):
     members = 2
 
     def sensor_specs(self):
-        return [sensor("member", 1), sensor("entities", 8, 2)]
+        return [sensor("member", 1), sensor("entities", sum(self.SIZES), 2)]
 
     def sensors(self):
         member = np.tile([[0.0], [1.0]], (self.teams, 1))

@@ -300,8 +300,8 @@ class ModelConfig:
     (gaussian), or a Gaussian squashed by tanh, its deviation an output of the network (tanh_normal)."""
     image_encoder: ImageKind = ImageKind.auto
     """Encoder of images and grids: ML-Agents' simple (from 20 x 20 on), nature (36), resnet (15), match3 (5)
-    or dense (any size), with as many features as the first hidden layer; auto: convolutions that fit the size,
-    with 128 features."""
+    or dense (any size), with as many features as the first hidden layer is wide; auto: convolutions that fit
+    the size, 128 features."""
     goal_conditioning: GoalKind = GoalKind.none
     """Sensors that are goal signals: observations like others (none), and, as ML-Agents' default has it, what
     another network makes the weights of the last hidden layer of (hyper; actors and local critics)."""
