@@ -60,31 +60,31 @@ class ObsLayout:
         Raises:
             ConfigError: a sensor is neither a vector, nor a set, nor an image.
         """
-        vector, goal_vectors = 0, []
-        images, sets, goal_keys = [], [], []
-        for index, shape in enumerate(shapes):
-            is_goal, key = goals is not None and goals[index], keys.SENSOR.format(index)
-            if len(shape) == 1:
-                goal_vectors += [(vector, vector + shape[0])] if is_goal else []
-                vector += shape[0]
-                continue
-
-            if len(shape) not in (2, 3):
+        entries = [(keys.SENSOR.format(i), tuple(shape)) for i, shape in enumerate(shapes)]
+        for key, shape in entries:
+            if len(shape) not in (1, 2, 3):
                 raise ConfigError(
-                    f"sensor obs_{index} has shape {tuple(shape)}; vectors (1 dimension), entities of "
-                    "varying number (2) and images or grids (3) can be learned from"
+                    f"sensor {key} has shape {shape}; vectors (1 dimension), entities of varying number (2) "
+                    "and images or grids (3) can be learned from"
                 )
-            (sets if len(shape) == 2 else images).append((key, tuple(shape)))
-            goal_keys += [key] if is_goal else []
+        goal_keys = [key for (key, _), goal in zip(entries, goals or ()) if goal]
 
+        vector = 0
+        goal_vectors: list[tuple[int, int]] = []
+        for key, (size, *rest) in entries:
+            if not rest:
+                goal_vectors += [(vector, vector + size)] if key in goal_keys else []
+                vector += size
+
+        images, sets = (tuple(entry for entry in entries if len(entry[1]) == n) for n in (3, 2))
         dims = [guessed_channel_dim(tuple(s)) for s in shapes] if channel_dims is None else channel_dims
         return cls(
             vector,
-            tuple(images),
+            images,
             tuple(dim for dim in dims if dim is not None),
-            tuple(sets),
+            sets,
             tuple(goal_vectors),
-            tuple(goal_keys),
+            tuple(key for key, _ in (*images, *sets) if key in goal_keys),
         )
 
     @classmethod
@@ -180,12 +180,11 @@ class Encoder(nn.Module):
         is_normed = cfg.normalize_obs and layout.vector
         self.norm: nn.Module = RunningNorm(layout.vector) if is_normed else nn.Identity()
         dims = layout.channel_dims or (FIRST,) * len(layout.images)
-        self.images = nn.ModuleList(
-            [ImageEncoder(s, dim, cfg.image_encoder, width) for (_, s), dim in zip(layout.images, dims)]
-        )
+        images = [ImageEncoder(s, dim, cfg.image_encoder, width) for (_, s), dim in zip(layout.images, dims)]
+        self.images = nn.ModuleList(images)
         self.vector, self.has_vector = layout.vector, layout.vector > 0
 
-        widths = [(key, net.size) for (key, _), net in zip(layout.images, self.images)]
+        widths = [(key, net.size) for (key, _), net in zip(layout.images, images)]
         around = layout.vector + sum(size for _, size in widths)
         sizes = [shape[1] for _, shape in layout.sets]
         self.sets = EntityEncoder(sizes, around) if sizes else None
