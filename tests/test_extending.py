@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from mappo_unity.cli.train import help_text
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.option_table import option_table
-from mappo_unity.config.schema import Config, ModelConfig
+from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks import encoders
 from mappo_unity.runs import checkpoint
@@ -177,7 +177,7 @@ def test_an_encoder_for_a_new_shape_trains(
     layout = encoders.ObsLayout(2, (("obs_1", VOXELS),))
     monkeypatch.setattr(encoders.ObsLayout, "from_shapes", classmethod(lambda cls, *args: layout))
     monkeypatch.setattr(encoders, "ImageEncoder", VoxelEncoder)
-    encoder = encoders.Encoder(layout, ModelConfig(), 8)
+    encoder = encoders.Encoder(layout, True)
     assert encoder(torch.zeros(5, 2), torch.zeros(5, *VOXELS)).shape == (5, 9)
 
     outcome = train(compose_config([*TINY, voxel_module]).config, tmp_path / "run")

@@ -117,7 +117,7 @@ def test_initial_weights_of_attention_are_t_fixup_s_whatever_the_options_say():
 
 def test_entities_stand_behind_vectors_and_images_and_are_not_normalised():
     layout = ObsLayout.from_shapes([(6, 3), (2,), (1, 8, 8), (4, 2), (3,)])
-    encoder = Encoder(layout, ModelConfig(), 16)
+    encoder = Encoder(layout, True)
     assert layout.keys == ["observation", "obs_2", "obs_0", "obs_3"]
     assert layout.team_dims == [-2, -4, -3, -3]
     (norm,) = [part for part in encoder.modules() if isinstance(part, RunningNorm)]
@@ -243,7 +243,7 @@ def test_goals_of_every_kind_are_found_among_the_features():
     layout = ObsLayout.from_shapes(
         [(2,), (1, 8, 8), (3,), (4, 2), (1, 9, 9)], goals=[True, False, False, True, True]
     )
-    encoder = Encoder(layout, ModelConfig(), 16)
+    encoder = Encoder(layout, True)
     assert encoder.goal_columns == [0, 1, *range(5 + 128, 5 + 256), *range(5 + 256, 5 + 384)]
 
 

@@ -113,7 +113,7 @@ def test_a_pooled_critic_does_not_care_in_which_order_team_mates_stand():
 @pytest.mark.parametrize("shape", [(3, 40, 40), (40, 40, 3), (5, 12, 12)])
 def test_images_are_encoded(shape):
     layout = ObsLayout.from_shapes([(4,), shape])
-    encoder = Encoder(layout, ModelConfig(), 16)
+    encoder = Encoder(layout, True)
     assert layout.keys == ["observation", "obs_1"]
     assert encoder(torch.zeros(2, 3, 4), torch.zeros(2, 3, *shape)).shape == (2, 3, encoder.size)
 

@@ -1,19 +1,25 @@
-"""Options of one behavior name: the sections ppo and model, with its own overrides on top."""
+"""Options of one behavior name: the sections of its learner, with its own overrides on top."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
 from dataclasses import fields
-from typing import Any
+from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mappo_unity.config.schema import Config, ModelConfig, PPOConfig
+from mappo_unity.config.schema import Config, ModelConfig, PPOConfig, RewardsConfig
 from mappo_unity.errors import ConfigError
 
-SECTIONS = ("model", "ppo")
+
+class BehaviorConfig(NamedTuple):
+    """The sections that can differ by behavior."""
+
+    model: ModelConfig
+    ppo: PPOConfig
+    rewards: RewardsConfig
 
 
 def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:
@@ -32,8 +38,8 @@ def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:
         behavior_config(cfg, name)
 
 
-def behavior_config(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
-    """Return the model and learner options of a policy name.
+def behavior_config(cfg: Config, policy: str) -> BehaviorConfig:
+    """Return the options of a policy name.
 
     Raises:
         ConfigError: an override names no option, or its value has the wrong type or range.
@@ -45,15 +51,14 @@ def behavior_config(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
     if not isinstance(own, dict):
         raise ConfigError(f"{where}={own!r} must hold sections, for example {where}.ppo.lr=1e-4")
 
+    *others, last = sections = BehaviorConfig._fields
     for section in own:
-        if section not in SECTIONS:
+        if section not in sections:
             raise ConfigError(
-                f"{where}.{section}: only the sections {' and '.join(SECTIONS)} can differ by behavior"
+                f"{where}.{section}: only the sections {', '.join(others)} and {last} can differ by behavior"
             )
 
-    model = _merged(cfg.model, own.get("model"), f"{where}.model")
-    ppo = _merged(cfg.ppo, own.get("ppo"), f"{where}.ppo")
-    return model, ppo
+    return BehaviorConfig(*(_merged(getattr(cfg, s), own.get(s), f"{where}.{s}") for s in sections))
 
 
 def _merged(section: Any, own: Any, where: str) -> Any:

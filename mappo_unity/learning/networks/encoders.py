@@ -15,10 +15,10 @@ from mlagents_envs.base_env import ObservationSpec
 from torch import Tensor, nn
 
 from mappo_unity import keys
-from mappo_unity.config.schema import ModelConfig
+from mappo_unity.config.schema import ImageKind
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.attention import ENTITY_FEATURES, EntityEncoder
-from mappo_unity.learning.networks.images import ImageEncoder
+from mappo_unity.learning.networks.images import IMAGE_FEATURES, ImageEncoder
 from mappo_unity.scenes.contract.images import FIRST, channel_dim, guessed_channel_dim
 from mappo_unity.scenes.contract.sensors import is_goal, is_set
 
@@ -169,18 +169,24 @@ class Encoder(nn.Module):
 
     Args:
         layout: the entries.
-        cfg: whether vectors are normalised, and how images are encoded.
-        width: of the network's first hidden layer.
+        normalize: whether vectors are normalised.
+        kind: the encoder of images.
+        width: features of an image where ML-Agents' encoders encode it: those of the first hidden layer.
 
     Attributes: `size`, F; `goal_columns`, those of the F that are goal signals.
     """
 
-    def __init__(self, layout: ObsLayout, cfg: ModelConfig, width: int) -> None:
+    def __init__(
+        self,
+        layout: ObsLayout,
+        normalize: bool,
+        kind: ImageKind = ImageKind.auto,
+        width: int = IMAGE_FEATURES,
+    ) -> None:
         super().__init__()
-        is_normed = cfg.normalize_obs and layout.vector
-        self.norm: nn.Module = RunningNorm(layout.vector) if is_normed else nn.Identity()
+        self.norm: nn.Module = RunningNorm(layout.vector) if normalize and layout.vector else nn.Identity()
         dims = layout.channel_dims or (FIRST,) * len(layout.images)
-        images = [ImageEncoder(s, dim, cfg.image_encoder, width) for (_, s), dim in zip(layout.images, dims)]
+        images = [ImageEncoder(s, dim, kind, width) for (_, s), dim in zip(layout.images, dims)]
         self.images = nn.ModuleList(images)
         self.vector, self.has_vector = layout.vector, layout.vector > 0
 
