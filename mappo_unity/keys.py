@@ -13,6 +13,8 @@ An entry of a batch has shape ``[T, G, A, ...]`` for a policy with one side and 
 for a policy with several.
 """
 
+import re
+
 OBS = "observation"  # float32 [..., A, O]: vector sensors, concatenated in the order of the specs
 SENSOR = "obs_{}"  # float32 [..., A, *sensor shape]: sensor i before concatenation
 ACTION = "action"  # see models.ActionLayout
@@ -44,3 +46,8 @@ def team_id(behavior_name: str) -> int:
     """Return the side of a behavior: ``"SoccerTwos?team=1"`` -> 1; 0 where none is given."""
     _, _, query = behavior_name.partition("?team=")
     return int(query) if query else 0
+
+
+def file_stem(policy: str) -> str:
+    """Return how files of a policy name are called: its own name, with ``_`` for what one may not hold."""
+    return re.sub(r"[^\w.-]", "_", policy)

@@ -6,6 +6,7 @@ import importlib
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from mappo_unity.config.schema import (
 )
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.onnx_policy import OnnxFolder
+from mappo_unity.policies.policy import RandomPolicy
+from mappo_unity.protocol.demos.reader import read_demo
 from mappo_unity.runs import folder as runs
 from mappo_unity.scenes.core.shapes import RED, ball
 from mappo_unity.scenes.registry import drawing_of
@@ -94,6 +97,49 @@ def test_a_folder_of_onnx_files_plays_every_behavior(shared: Path) -> None:
         policy_of(cfg, open_scene(cfg))
 
 
+def test_what_is_played_is_recorded_and_needs_no_display(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    file = tmp_path / "run.demo"
+    assert play_main(["env=Basic", f"record={file}", "seconds=9", "seed=3"]) == 0
+    demo = read_demo(file)
+    said = f"{file}: {len(demo)} decisions of {len(demo.returns)} episodes\n"
+    assert said in capsys.readouterr().out and len(demo) > 50
+    ended = demo.returns[:-1] if demo.interrupted[-1] else demo.returns
+    assert set(np.round(ended, 6)) <= set(np.round(_returns_of_basic(len(demo)), 6))
+
+    assert play_main(["env=Basic", f"record={file}"]) == 2
+    assert f"recording {file} exists already: give another name" in capsys.readouterr().err
+
+
+def _returns_of_basic(decisions: int) -> np.ndarray:
+    """Return what episodes of so many decisions at most can earn: 1 or 0.1, and 0.01 less for each."""
+    costs = 0.01 * np.arange(1, decisions + 1)
+    return np.concatenate([1 - costs, 0.1 - costs])
+
+
+def test_a_recording_that_is_interrupted_keeps_what_was_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def act(self: RandomPolicy, behavior: str, steps: Any, spec: Any) -> Any:
+        if len(actions) == 30:
+            raise KeyboardInterrupt
+        actions.append(plain(self, behavior, steps, spec))
+        return actions[-1]
+
+    actions: list[Any] = []
+    plain = RandomPolicy.act
+    monkeypatch.setattr(RandomPolicy, "act", act)
+    assert play_main(["env=Basic", f"record={tmp_path / 'run.demo'}"]) == 130
+    assert "mappo-play: interrupted" in capsys.readouterr().err
+    demo = read_demo(tmp_path / "run.demo")
+    assert demo.discrete.tolist() == [action.discrete[0].tolist() for action in actions][: len(demo)]
+    assert len(demo) in (29, 30) and demo.done[-1]
+    assert [file.name for file in tmp_path.iterdir()] == ["run.demo"]
+
+
 @pytest.mark.skipif("DISPLAY" not in os.environ, reason="needs a display (xvfb-run pytest ...)")
 def test_a_window_shows_frames_at_their_time() -> None:
     start = time.monotonic()
@@ -122,6 +168,17 @@ def test_a_window_shows_frames_at_their_time() -> None:
             "checkpoints/step_*.pt, *.onnx\n",
         ),
         (["env=Basic"], "there is no display"),
+        (["env=Basic", "record="], "record= is empty"),
+        (
+            ["env=Basic", "record=run.mp4"],
+            "recording run.mp4 must end in .demo, or be a folder for NAME.demo",
+        ),
+        (["env=Basic", "record=no/run.demo"], "recording no/run.demo cannot be written: "),
+        (
+            ["env=WallJump", "record=run.demo"],
+            "recording run.demo would be of several behaviors, but a file is of one: name a folder, such as "
+            "run/, for SmallWallJump.demo and BigWallJump.demo",
+        ),
     ],
 )
 def test_mistakes_are_told(

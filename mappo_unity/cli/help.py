@@ -43,16 +43,19 @@ Example:
 """
 
 PLAY_USAGE = """\
-Show a policy in its embedded scene: in a window, or in a video file, which needs no display.
+Show a policy in its embedded scene: in a window, or in a video file, which needs no display. Or record
+what it does as a demonstration, which ML-Agents reads, too.
 
 Usage:
   mappo-play run=RUN [video=FILE]           a run folder (its best checkpoint) or a checkpoint
   mappo-play env=NAME [policy=ONNX]         random actions, an ONNX file or a folder of NAME.onnx
+  mappo-play ... record=FILE.demo           a demonstration; with video=FILE also that, else nothing is shown
   mappo-play --help | --version
 
 Examples:
   mappo-play run=outputs/3DBall/2026-11-20_12-00-00 video=3DBall.mp4
   mappo-play env=SoccerTwos policy=SoccerTwos.onnx video=match.gif seconds=8 width=480 height=272
+  mappo-play run=outputs/3DBall/2026-11-20_12-00-00 record=expert.demo seconds=300
 """
 
 EXPORT_USAGE = """\

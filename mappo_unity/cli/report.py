@@ -135,6 +135,9 @@ def play_line(result: dict[str, Any]) -> str:
 
     if result["episodes"]:
         line += f"; {result['episodes']} agent episodes ended, mean return {result['mean_return']:.4g}"
+    for file in result["recorded"]:
+        held = f"{file.decisions:,} decisions of {file.episodes:,} episodes"
+        line += f"\n{file.path}: {held if file.decisions else 'not written, no decision was played out'}"
 
     return line
 

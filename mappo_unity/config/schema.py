@@ -625,8 +625,7 @@ class Config:
         _at_least("max_jobs", self.max_jobs, 1)
         _rule("stop_at_return", self.stop_at_return, True, "must be a finite number or null")
 
-        kind, _, index = self.device.partition(":")
-        if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
+        if not re.fullmatch(r"cpu|cuda(:[0-9]+)?", self.device):
             raise ConfigError(f"device={self.device!r} must be one of cpu, cuda, cuda:N")
 
 
@@ -679,9 +678,11 @@ class PlayConfig:
     policy: Optional[str] = None
     """With env: an ONNX file, or a folder with NAME.onnx for each behavior; null: random actions."""
     video: Optional[str] = None
-    """File to write, NAME.mp4 or NAME.gif; null: a window on the display."""
+    """File to write, NAME.mp4 or NAME.gif; null: a window on the display, or with record nothing."""
+    record: Optional[str] = None
+    """New demonstration to write, NAME.demo, or a folder for the NAME.demo of each of several behaviors."""
     seconds: float = 20.0
-    """Length of the video, at the scene's own pace."""
+    """Length of the video or recording, at the scene's own pace."""
     caption: bool = True
     """Write a line into the picture: scene, time, return of the episode so far (in soccer: goals)."""
     deterministic: bool = False
@@ -694,7 +695,7 @@ class PlayConfig:
     """Height of the picture in pixels, even."""
 
     def __post_init__(self) -> None:
-        _not_empty(run=self.run, env=self.env, policy=self.policy, video=self.video)
+        _not_empty(run=self.run, env=self.env, policy=self.policy, video=self.video, record=self.record)
         _above("seconds", self.seconds, 0)
         _within("seed", self.seed, 0, 2**31 - 1)
 

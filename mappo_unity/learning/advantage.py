@@ -123,6 +123,11 @@ def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
     return (values * weight).sum() / weight.sum().clamp_min(1.0)
 
 
+def last_mean(values: Tensor) -> Tensor:
+    """Return the mean over the last dimension, which becomes 1; where it is 1, the values themselves."""
+    return values if values.shape[-1] == 1 else values.mean(-1, keepdim=True)
+
+
 def normalize(values: Tensor, mask: Tensor, eps: float = 1e-5) -> Tensor:
     """Return ``(values - mean) / (std + eps)`` with statistics over ``mask``; 0 elsewhere."""
     mean = masked_mean(values, mask)
@@ -154,13 +159,15 @@ def value_metrics(names: Sequence[str], value: Tensor, target: Tensor, mask: Ten
     return metrics
 
 
-def approximate_kl(log_ratio: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the approximate KL of log-ratios ``[..., n]`` of an action's n components, a scalar.
+def approximate_kl(log_ratio: Tensor, ratio: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the approximate KL of ratios ``[..., n]`` of an action's n components, a scalar.
 
     k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative.
     """
-    joint = log_ratio.sum(-1, keepdim=True)
-    return masked_mean(joint.exp() - 1 - joint, mask)
+    if log_ratio.shape[-1] > 1:
+        log_ratio = log_ratio.sum(-1, keepdim=True)
+        ratio = log_ratio.exp()
+    return masked_mean(ratio - 1 - log_ratio, mask)
 
 
 def scheduled(schedule: Schedule, start: float, final: float, progress: float) -> float:

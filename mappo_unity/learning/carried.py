@@ -88,12 +88,12 @@ class CarriedRounds:
         """Return what resuming needs."""
         return None if self.rounds is None else {str(k): v.clone() for k, v in self.rounds.items()}
 
-    def load_state_dict(self, state: dict[str, Tensor] | None) -> None:
-        """Restore what `state_dict` returned."""
+    def load_state_dict(self, state: dict[str, Tensor] | None, device: torch.device) -> None:
+        """Restore what `state_dict` returned, on the device of the networks."""
         if state is None:
             self.rounds = None
             return
-        self.rounds = TensorDict(state, state[VALUED].shape[:-1])
+        self.rounds = TensorDict({k: v.to(device) for k, v in state.items()}, state[VALUED].shape[:-1])
 
 
 def _like(values: np.ndarray, other: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from mappo_unity import keys
 from mappo_unity.config.schema import EntropyKind, PPOConfig, RatioKind, ValueLoss
-from mappo_unity.learning.advantage import masked_mean
+from mappo_unity.learning.advantage import last_mean, masked_mean
 from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import ActionDistribution
 from mappo_unity.learning.networks.poca import PocaCritic
@@ -36,7 +36,8 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         actor, critic: see `learning.networks.actor_critic`.
         cfg: the learner's options.
 
-    Attributes: `log_ratio` ``[..., n]`` and `entropy` ``[..., 1]`` of the last call, without gradients.
+    Attributes: `log_ratio` and `ratio` ``[..., n]`` and `entropy` ``[..., 1]`` of the last call, without
+    gradients; n is 1, or with ``ppo.ratio=component`` the components of an action.
     """
 
     def __init__(self, actor: UnityActor, critic: TensorDictModule, cfg: PPOConfig) -> None:
@@ -53,7 +54,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
         self._actor, self._critic = actor, critic.module
         self.critic_keys = [str(key) for key in critic.in_keys]
-        self.log_ratio = self.entropy = torch.zeros(())
+        self.log_ratio = self.ratio = self.entropy = torch.zeros(())
 
     def forward(self, rows: TensorDictBase) -> dict[str, Tensor]:
         """Return ``loss_objective``, ``loss_critic`` and ``loss_entropy``, scalars to be added.
@@ -63,7 +64,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         """
         clip, mask = self.clip_epsilon.item(), rows.get(ACTOR_LEARNS, None)
         dist = self._distribution(rows)
-        self.log_ratio, ratio = self._ratio(dist, rows, mask)
+        ratio = self._ratio(dist, rows, mask)
 
         advantage = rows.get(keys.ADVANTAGE)
         gain = torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
@@ -71,14 +72,14 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         self.entropy = entropy.detach()
 
         return {
-            "loss_objective": -masked_mean(gain.mean(-1, keepdim=True), mask),
+            "loss_objective": -masked_mean(last_mean(gain), mask),
             "loss_critic": self.cfg.value_coef * self._critic_loss(rows, clip),
             "loss_entropy": -self.entropy_coeff.item() * masked_mean(entropy, mask),
         }
 
     def compare(self, rows: TensorDictBase) -> None:
-        """Set `log_ratio` to what the policy now makes of these rows, without the rest of the loss."""
-        self.log_ratio, _ = self._ratio(self._distribution(rows), rows, rows.get(ACTOR_LEARNS, None))
+        """Set `log_ratio` and `ratio` to what the policy now makes of these rows, without the rest."""
+        self._ratio(self._distribution(rows), rows, rows.get(ACTOR_LEARNS, None))
 
     def _distribution(self, rows: TensorDictBase) -> ActionDistribution:
         obs = [rows.get(key) for key in self._actor.obs_keys]
@@ -87,10 +88,8 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         mask = rows.get(keys.MASK) if self._actor.layout.branches else None
         return ActionDistribution(params, self._actor.layout, mask)
 
-    def _ratio(
-        self, dist: ActionDistribution, rows: TensorDictBase, mask: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Return log-ratios (detached) and ratios ``[..., n]``: of the whole action, or of its components."""
+    def _ratio(self, dist: ActionDistribution, rows: TensorDictBase, mask: Tensor | None) -> Tensor:
+        """Return ratios ``[..., n]``: of the whole action, or of its components."""
         if self.cfg.ratio is RatioKind.component:
             new, old = dist.component_log_probs(rows.get(keys.ACTION)), rows.get(keys.LOG_PROBS)
         else:
@@ -102,7 +101,9 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         log_ratio = new - old
         if mask is not None:  # what stands in rows that do not count may be anything
             log_ratio = torch.where(mask, log_ratio, 0.0)
-        return log_ratio.detach(), log_ratio.exp()
+        ratio = log_ratio.exp()
+        self.log_ratio, self.ratio = log_ratio.detach(), ratio.detach()
+        return ratio
 
     def _critic_loss(self, rows: TensorDictBase, clip: float) -> Tensor:
         mask, target = rows.get(CRITIC_LEARNS, None), rows.get(keys.VALUE_TARGET)
@@ -135,7 +136,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         loss = self._unclipped(value, target)
         if old is not None:
             loss = torch.max(loss, self._unclipped(old + (value - old).clamp(-clip, clip), target))
-        return loss if loss.shape[-1] == 1 else loss.mean(-1, keepdim=True)
+        return last_mean(loss)
 
     def _unclipped(self, value: Tensor, target: Tensor) -> Tensor:
         if self.cfg.value_loss is ValueLoss.huber:

@@ -83,7 +83,8 @@ def make_buffer(rows: Any, decisions: Tensor, cfg: PPOConfig) -> ReplayBuffer:
     count = minibatch_count(cfg, int(decisions.sum()), len(rows))
     sampler = EvenSampler(decisions, count)
     # the rows themselves are the storage: nothing is copied in
-    return ReplayBuffer(storage=TensorStorage(rows), sampler=sampler, batch_size=max(1, len(rows) // count))
+    storage = TensorStorage(rows, device=decisions.device)
+    return ReplayBuffer(storage=storage, sampler=sampler, batch_size=max(1, len(rows) // count))
 
 
 def minibatch_count(cfg: PPOConfig, decisions: int, rows: int) -> int:

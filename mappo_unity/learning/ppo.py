@@ -21,6 +21,7 @@ from mappo_unity.learning.advantage import (
     Advantage,
     approximate_kl,
     estimate_streams,
+    last_mean,
     make_view,
     masked_mean,
     normalize,
@@ -226,14 +227,14 @@ class PolicyLearner:
             net.project()
 
         with torch.no_grad():
-            mask, log_ratio = minibatch.get(ACTOR_LEARNS, None), self.loss.log_ratio
-            clipped = ((log_ratio.exp() - 1).abs() > self.loss.clip_epsilon.item()).float()
+            mask, ratio = minibatch.get(ACTOR_LEARNS, None), self.loss.ratio
+            clipped = ((ratio - 1).abs() > self.loss.clip_epsilon.item()).float()
             return {
                 "policy_loss": losses["loss_objective"].detach(),
                 "value_loss": losses["loss_critic"].detach(),
                 "entropy": masked_mean(self.loss.entropy, mask),
-                "kl": approximate_kl(log_ratio, mask),
-                "clip_fraction": masked_mean(clipped.mean(-1, keepdim=True), mask),
+                "kl": approximate_kl(self.loss.log_ratio, ratio, mask),
+                "clip_fraction": masked_mean(last_mean(clipped), mask),
                 "grad_norm": grad_norm.detach(),
             }
 
@@ -241,7 +242,7 @@ class PolicyLearner:
     def _kl_after(self, minibatch: TensorDictBase) -> Tensor:
         """Return the approximate KL on the last minibatch, now that its step is taken."""
         self.loss.compare(minibatch)
-        return approximate_kl(self.loss.log_ratio, minibatch.get(ACTOR_LEARNS, None))
+        return approximate_kl(self.loss.log_ratio, self.loss.ratio, minibatch.get(ACTOR_LEARNS, None))
 
     @torch.no_grad()
     def _normalize_values(self, minibatch: TensorDictBase) -> None:
@@ -291,7 +292,7 @@ class PolicyLearner:
         self._load_trainable(state)
         self.value_norm.load_state_dict(by_stream(state["value_norm"]))
         self.rewards.load_state_dict(state.get("rewards", {}))
-        self.carried.load_state_dict(state.get("carried"))
+        self.carried.load_state_dict(state.get("carried"), self.params[0].device)
         self.reader.load_state_dict(state.get("critic_states", {}))
         self.rollbacks = int(state["rollbacks"])
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2

@@ -149,5 +149,6 @@ class ValueReader:
         return {name: state.clone() for name, state in self.states.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
-        self.states = dict(state)
+        """Restore what `state_dict` returned, on the critic's device."""
+        device = next(self.critic.parameters()).device
+        self.states = {name: values.to(device) for name, values in state.items()}

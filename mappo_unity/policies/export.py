@@ -99,7 +99,7 @@ def sample_inputs(entries: TensorDictBase, in_keys: Sequence[str]) -> dict[str, 
     acting = entries.get(keys.ACTING)[..., 0]
     rows = acting.flatten().nonzero()[:, 0]
     if len(rows) > SAMPLE_ROWS:
-        rows = rows[torch.linspace(0, len(rows) - 1, SAMPLE_ROWS).long()]
+        rows = rows[torch.linspace(0, len(rows) - 1, SAMPLE_ROWS, device=rows.device).long()]
 
     return {key: entries.get(key).flatten(0, acting.ndim - 1)[rows].cpu() for key in in_keys}
 

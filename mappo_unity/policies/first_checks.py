@@ -22,6 +22,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.policies.layouts import check_layout, check_two_sides
 from mappo_unity.policies.onnx_policy import OnnxFolder, OnnxPolicy
 from mappo_unity.policies.policy_files import SUFFIX, Kind, Source, check_checkpoint, check_resumable, locate
+from mappo_unity.protocol.demos.recording_env import recording_files
 from mappo_unity.protocol.ports import check_port
 from mappo_unity.runs.folder import CONFIG, find_run
 from mappo_unity.runs.options import config_to_play
@@ -67,7 +68,10 @@ def check_film(cfg: PlayConfig) -> None:
     config = _environment(source, known, cfg.env, "mappo-play")
     check_embedded(config.env)
     check_environment(config)
-    _check_fit([source], [known], _behaviors(config.env))
+    behaviors = _behaviors(config.env)
+    _check_fit([source], [known], behaviors)
+    if cfg.record is not None:
+        recording_files(Path(cfg.record), behaviors)
 
 
 def check_export(cfg: ExportConfig) -> None:

@@ -7,7 +7,6 @@ Recurrent files get each agent's memory back until its episode ends.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -236,7 +235,7 @@ class OnnxFolder:
 
 def file_name(policy: str) -> str:
     """Return the name of a policy's file: its own, with ``_`` for what a file name may not hold."""
-    return re.sub(r"[^\w.-]", "_", policy) + SUFFIX
+    return keys.file_stem(policy) + SUFFIX
 
 
 def open_session(data: bytes, name: str, seed: int = 0) -> Any:

@@ -2,7 +2,7 @@
 
 `messages` and `batch_encoding`: bytes on the wire. `server`, `process`, `client`: a trainer's side, one
 running player as a BaseEnv. `restarting_player`, `parallel_players`: players that fail, and many of them.
-`serve`: a scene as a player. Knows nothing of learning.
+`serve`: a scene as a player. `demos`: recordings in files. Knows nothing of learning.
 """
 
 import os

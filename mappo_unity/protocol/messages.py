@@ -51,8 +51,13 @@ OPTIONS = (
 
 
 @cache
-def message_class() -> Any:
-    """Return the class of UnityMessageProto, arrays as bytes; every other message hangs below it."""
+def message_class(file: str = "unity_message", message: str = "UnityMessageProto") -> Any:
+    """Return the class of a message, arrays as bytes; below UnityMessageProto hang most others.
+
+    Args:
+        file: the module of mlagents_envs that declares it, without ``_pb2``.
+        message: its name.
+    """
     install()
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
@@ -66,13 +71,13 @@ def message_class() -> Any:
 
         proto = descriptor_pb2.FileDescriptorProto()
         file.CopyToProto(proto)
-        for message in proto.message_type:
-            _declare_bytes(message)
+        for declared in proto.message_type:
+            _declare_bytes(declared)
         pool.Add(proto)
 
-    root = importlib.import_module(f"{PREFIX}unity_message_pb2").DESCRIPTOR
+    root = importlib.import_module(f"{PREFIX}{file}_pb2").DESCRIPTOR
     add(root)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{root.package}.UnityMessageProto"))
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{root.package}.{message}"))
 
 
 def _declare_bytes(message: Any) -> None:

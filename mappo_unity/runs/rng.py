@@ -18,13 +18,14 @@ def seed_everything(seed: int) -> None:
 
 
 def get_rng_state() -> dict[str, Any]:
-    """Return the states of torch's, numpy's and Python's global generators."""
+    """Return the states of torch's, numpy's and Python's global generators, and of the GPUs' in use."""
     kind, keys_, position, has_gauss, cached = np.random.get_state()
     version, internal, gauss_next = random.getstate()
 
     return {
         "torch": torch.get_rng_state(),
-        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        # asking would start every GPU, and take memory of it
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
         "numpy": [
             str(kind),
             np.asarray(keys_).astype(np.int64),
@@ -39,8 +40,10 @@ def get_rng_state() -> dict[str, Any]:
 def set_rng_state(state: dict[str, Any]) -> None:
     """Go back to what `get_rng_state` returned."""
     torch.set_rng_state(state["torch"])
-    if state["cuda"] and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all(state["cuda"])
+    if torch.cuda.is_initialized():
+        # a run may go on where there are fewer GPUs, or more
+        for index, generator in zip(range(torch.cuda.device_count()), state["cuda"]):
+            torch.cuda.set_rng_state(generator, index)
 
     kind, keys_, position, has_gauss, cached = state["numpy"]
     np.random.set_state((kind, np.asarray(keys_).astype(np.uint32), position, has_gauss, cached))

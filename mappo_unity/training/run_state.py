@@ -163,7 +163,8 @@ class RunState:
         # an environment that gives no snapshots begins new episodes
         if state["env"] is not None:
             # without its environment's state a run begins new episodes, and memories anew with them
-            self.setup.policy.memories = dict(state.get("memories", {}))
+            memories = state.get("memories", {})
+            self.setup.policy.memories = {name: m.to(self.cfg.device) for name, m in memories.items()}
             self._restore_env(path, checkpoint.to_arrays(state["env"]))
 
         self.recent_episodes.load_state_dict(state["window"])

@@ -128,9 +128,19 @@ def prepare_torch(cfg: Config) -> None:
     """Set threads and seeds; check the device."""
     torch.set_num_threads(cfg.num_threads)
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every storage
-    if cfg.device.startswith("cuda") and not torch.cuda.is_available():
-        raise ConfigError(f"device={cfg.device}: this torch finds no CUDA device; use device=cpu")
+    check_device(cfg.device)
     seed_everything(cfg.seed)
+
+
+def check_device(device: str) -> None:
+    """Raise ConfigError if torch does not find the device of the networks."""
+    if device == "cpu":
+        return
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if not count:
+        raise ConfigError(f"device={device}: this torch finds no CUDA device; use device=cpu")
+    if int(device.partition(":")[2] or 0) >= count:
+        raise ConfigError(f"device={device}: the last CUDA device that torch finds is cuda:{count - 1}")
 
 
 def make_unity_env(cfg: Config, folder: Path) -> UnityEnv:

@@ -1,17 +1,20 @@
-"""What mappo-play does: show a policy in its embedded scene, in a video file or in a window."""
+"""What mappo-play does: show a policy in its embedded scene, in a video or a window, or record it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from mlagents_envs.base_env import BaseEnv
 
 from mappo_unity.config.schema import PlayConfig
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.policies.first_checks import check_embedded
 from mappo_unity.policies.policy import Policy
+from mappo_unity.protocol.demos.recording_env import RecordingEnv
 from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes.core.scene import Scene
 from mappo_unity.scenes.core.shapes import Camera, Drawing, Follow, Shape
@@ -27,22 +30,31 @@ RANDOM = "random"
 
 
 class Screen(Protocol):
-    """What shows frames: a video file or a window."""
+    """What shows frames: a video file, a window, or nothing."""
 
     def show(self, shapes: Sequence[Shape], camera: Camera, caption: Sequence[str] = ()) -> bool:
         """Show a frame, with a line of text unless it is empty; return whether another one is wanted."""
         ...
 
 
+class Unseen:
+    """Show nothing, and want more."""
+
+    def show(self, shapes: Sequence[Shape], camera: Camera, caption: Sequence[str] = ()) -> bool:
+        """Return True."""
+        return True
+
+
 def play(cfg: PlayConfig) -> dict[str, Any]:
     """Show a policy in one area of its scene for `cfg.seconds`.
 
     Returns:
-        Scene, policy, seconds and frames shown, and the agent episodes that ended with their mean return.
+        Scene, policy, seconds and frames shown, the agent episodes that ended with their mean return, and
+        what was recorded.
 
     Raises:
         ConfigError: no scene of ours, no policy that fits it, no way to draw or to write the file.
-        Interrupted: SIGTERM came; like after Ctrl-C, nothing of the video is left.
+        Interrupted: SIGTERM came; as after Ctrl-C, nothing of the video is left, and what was recorded is.
     """
     video = Path(cfg.video) if cfg.video else None
     if video is not None:
@@ -51,23 +63,33 @@ def play(cfg: PlayConfig) -> dict[str, Any]:
     torch.set_num_threads(1)
     torch.manual_seed(cfg.seed)
 
-    scene = open_scene(cfg)
-    try:
+    with ExitStack() as stack:
+        scene = open_scene(cfg)
+        stack.callback(scene.close)
         policy = policy_of(cfg, scene)
+        recording = RecordingEnv(scene, cfg.record) if cfg.record is not None else None
+        if recording is not None:
+            stack.callback(recording.close)
+        if video is not None or recording is not None:
+            stack.enter_context(termination_as_interrupt())
+
         drawing = drawing_of(scene.NAME)
         pace = Pace(drawing, cfg.seconds)
+        screen = stack.enter_context(_screen(cfg, scene, drawing, pace.fps))
+        figures = _roll(recording or scene, policy, Projector(scene, drawing, pace, screen, cfg.caption))
 
-        first, size = drawing.view(scene, 0), (cfg.width, cfg.height)
-        if video is not None:
-            with termination_as_interrupt(), VideoFile(video, first, size, pace.fps) as file:
-                figures = _roll(scene, policy, Projector(scene, drawing, pace, file, cfg.caption))
-        else:
-            with Window(first, size, pace.fps, f"mappo-play {scene.NAME}") as window:
-                figures = _roll(scene, policy, Projector(scene, drawing, pace, window, cfg.caption))
-    finally:
-        scene.close()
+    head = {"scene": scene.NAME, "policy": cfg.run or cfg.policy or RANDOM, "video": cfg.video}
+    return head | figures | {"recorded": [] if recording is None else recording.recorded}
 
-    return {"scene": scene.NAME, "policy": cfg.run or cfg.policy or RANDOM, "video": cfg.video} | figures
+
+def _screen(cfg: PlayConfig, scene: Scene, drawing: Drawing, fps: float) -> AbstractContextManager[Screen]:
+    """Return what shows the frames, a context manager."""
+    first, size = drawing.view(scene, 0), (cfg.width, cfg.height)
+    if cfg.video is not None:
+        return VideoFile(Path(cfg.video), first, size, fps)
+    if cfg.record is not None:
+        return nullcontext(Unseen())
+    return Window(first, size, fps, f"mappo-play {scene.NAME}")
 
 
 def open_scene(cfg: PlayConfig) -> Scene:
@@ -125,21 +147,21 @@ class Projector:
         self.over = not wanted or self.frames >= self.pace.frames
 
 
-def _roll(scene: Scene, policy: Policy, projector: Projector) -> dict[str, Any]:
-    """Play until the video is over."""
-    scene.after_tick = projector.tick
-    scene.reset()
+def _roll(env: BaseEnv, policy: Policy, projector: Projector) -> dict[str, Any]:
+    """Play the projector's scene, of which `env` hands calls on, until the video is over."""
+    projector.scene.after_tick = projector.tick
+    env.reset()
 
     # Frames are shown by `tick`, from within the steps of the scene.
     while not projector.over:
-        steps = {name: scene.get_steps(name) for name in scene.behavior_specs}
+        steps = {name: env.get_steps(name) for name in env.behavior_specs}
         for name, begun in projector.tally.add(steps).items():
             policy.end(name, steps[name][1].agent_id.tolist())
             policy.forget(name, begun)
-            decisions, spec = steps[name][0], scene.behavior_specs[name]
+            decisions, spec = steps[name][0], env.behavior_specs[name]
             if len(decisions):
-                scene.set_actions(name, policy.act(name, decisions, spec))
-        scene.step()
+                env.set_actions(name, policy.act(name, decisions, spec))
+        env.step()
 
     returns = projector.tally.returns
     return {

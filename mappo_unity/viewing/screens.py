@@ -12,6 +12,8 @@ def check_screen(cfg: PlayConfig) -> None:
     """Raise ConfigError if the video cannot be written or drawn, or no window can be opened."""
     check_mujoco()
 
+    if cfg.video is None and cfg.record is not None:
+        return  # it is recorded, and not shown
     if cfg.video is None:
         from mappo_unity.viewing.window import check_display
 

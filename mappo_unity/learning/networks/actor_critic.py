@@ -235,6 +235,14 @@ def value_layers(critic: TensorDictModule) -> list[nn.Linear]:
     return [member.head for member in getattr(net, "nets", [net])]
 
 
+def _written(actor: TensorDictModuleBase) -> list[str]:
+    """Return the entries that `JointPolicy` writes for an actor."""
+    written = [keys.ACTION, keys.LOG_PROB]
+    if isinstance(actor, UnityActor):
+        written += [keys.LOG_PROBS] * actor.keeps_components + [keys.MEMORY] * actor.has_memory
+    return written
+
+
 class JointPolicy(TensorDictModuleBase):
     """The actors of all policy names as one policy for the collector; it keeps the agents' memories."""
 
@@ -245,7 +253,8 @@ class JointPolicy(TensorDictModuleBase):
         self.names = list(actors)
         self.inputs = [[str(k) for k in actor.in_keys if k != keys.MEMORY] for actor in actors.values()]
         self.in_keys = [(name, k) for name, inputs in zip(self.names, self.inputs) for k in inputs]
-        self.out_keys = [(n, k) for n in actors for k in (keys.ACTION, keys.LOG_PROB)]
+        # all that is written: on a GPU the collector takes no other entries over from the policy's copy
+        self.out_keys = [(name, k) for name, actor in actors.items() for k in _written(actor)]
         self.memories: dict[str, Tensor] = {}  # states [..., A, M] before the next decisions
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

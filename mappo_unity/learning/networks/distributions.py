@@ -184,7 +184,9 @@ class ActionDistribution(Distribution):
         """
         total = torch.zeros(())
         if self.layout.continuous:
-            columns = self.log_std + 0.5 + _LOG_SQRT_2PI + self._mean_log_slope()
+            columns = self.log_std + 0.5 + _LOG_SQRT_2PI
+            if self.layout.squashed:
+                columns = columns + self._mean_log_slope()
             total = columns.mean(-1) if mean else columns.sum(-1)
 
         for log_probs in self.log_probs:
@@ -205,27 +207,25 @@ class ActionDistribution(Distribution):
             return value
         return CONTINUOUS_LIMIT * value.tanh().clamp(-TANH_LIMIT, TANH_LIMIT)
 
-    def _mean_log_slope(self) -> Tensor | float:
+    def _mean_log_slope(self) -> Tensor:
         """Mean logarithm of the slope of `squash`, by which it changes the entropy, for each column.
 
         It has no closed form; quadrature gives it without the noise of drawing it.
         """
-        if not self.layout.squashed:
-            return 0.0
         std = torch.exp(self.log_std)
-        return sum(w * _log_slope(self.loc + std * x) for x, w in zip(_NODES, _WEIGHTS))
+        parts = [w * _log_slope(self.loc + std * x) for x, w in zip(_NODES, _WEIGHTS)]
+        return sum(parts[1:], parts[0])
 
     def _continuous_log_prob(self, value: Tensor) -> Tensor:
         return self._column_log_probs(value).sum(-1)
 
     def _column_log_probs(self, value: Tensor) -> Tensor:
-        slope: Tensor | float = 0.0
         if self.layout.squashed:
             value = (value / CONTINUOUS_LIMIT).clamp(-TANH_LIMIT, TANH_LIMIT).atanh()
-            slope = _log_slope(value)
 
         z = (value - self.loc) * torch.exp(-self.log_std)
-        return -0.5 * z * z - self.log_std - _LOG_SQRT_2PI - slope
+        log_probs = -0.5 * z * z - self.log_std - _LOG_SQRT_2PI
+        return log_probs - _log_slope(value) if self.layout.squashed else log_probs
 
     def _sample_continuous(self, sample_shape: Sequence[int]) -> Tensor:
         shape = torch.Size(sample_shape) + self.loc.shape
