@@ -116,6 +116,16 @@ class Everything(Probe):
     def earn(self, choice):
         return choice, np.zeros(self.teams)
 
+    def get_state(self):
+        return {"rng": self.rng.bit_generator.state, "obs": [obs.copy() for obs in self.result[0].obs]}
+
+    def set_state(self, state):
+        self.reset()
+        self.rng.bit_generator.state = state["rng"]
+        # every decision is the first of an episode: nothing else is under way
+        for values, saved in zip(self.result[0].obs, state["obs"]):
+            values[:] = saved
+
 
 PROBES = {cls.__name__: cls for cls in (Largest, LargestTeam, Goal, Everything)}
 
