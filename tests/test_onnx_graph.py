@@ -13,13 +13,13 @@ from mappo_unity.config.schema import (
     Activation,
     DistributionKind,
     GoalKind,
-    ImageKind,
     MemoryKind,
     ModelConfig,
 )
 from mappo_unity.learning.networks.actor_critic import make_actor
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
+from mappo_unity.learning.networks.images import MIN_SIDES
 from mappo_unity.policies.onnx_check import compare
 from mappo_unity.policies.onnx_graph import ExportError, build_model
 from mappo_unity.policies.onnx_policy import open_session
@@ -115,8 +115,8 @@ CASES = {
         {"goals": [True], "goal_conditioning": GoalKind.hyper, "hidden": [16]},
     ),
     **{
-        f"image, {kind.value}": ([[3, 37, 40], [36, 36, 1]], 2, [], {"image_encoder": kind})
-        for kind in ImageKind
+        f"image, {kind.value}": ([[3, side, side + 4], [side + 1, side, 1]], 2, [], {"image_encoder": kind})
+        for kind, side in MIN_SIDES.items()
     },
     "image, channels last": ([[4], [22, 20, 3], [2]], 2, [], {}),
 }
