@@ -203,6 +203,21 @@ class ActionReward(Probe):
         return choice, np.zeros(self.teams)
 
 
+class Level(ActionReward):
+    """The same times a parameter that can be set while it plays."""
+
+    def __init__(self, seed, level=1.0, **options):
+        super().__init__(seed, **options)
+        self.level = level
+
+    def set_parameter(self, name, value):
+        assert name == "level"
+        self.level = value
+
+    def earn(self, choice):
+        return self.level * choice, np.zeros(self.teams)
+
+
 class ObsActionReward(ObsReward):
     """The reward is observation times choice: follow the sign."""
 
@@ -418,7 +433,7 @@ class TeamRecall(Recall):
 PROBES = {
     cls.__name__: cls
     for cls in (
-        *(Constant, ObsReward, Delayed, ActionReward, ObsActionReward),
+        *(Constant, ObsReward, Delayed, ActionReward, Level, ObsActionReward),
         *(Credit, MateKnows, EarlyDeath, Staggered, NewIds, TimeLimit, RealEnd),
         *(Recall, LongRecall, StaggeredRecall, TeamRecall),
         Chain,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import re
@@ -21,6 +22,7 @@ import pytest
 
 from mappo_unity.cli import train_main
 from mappo_unity.cli.player import run as player_main
+from mappo_unity.config.parameters.samplers import Sampler
 from mappo_unity.config.schema import Backend, EnvConfig
 from mappo_unity.envs.backends import PLAYER_STRIDE, make_env_function
 from mappo_unity.errors import ConfigError, EnvironmentFailure
@@ -97,6 +99,47 @@ def wait_until(holds: Callable[[], bool], seconds: float = 20.0) -> bool:
 
 class TestPlayer:
     """One player that works."""
+
+    def test_it_draws_from_samplers_as_the_embedded_scene(self, build: str, tmp_path: Path) -> None:
+        done = {"measure": "progress", "threshold": 0.5}
+        first = {"sampler": "uniform", "min": 0.5, "max": 2}
+        scale = {"lessons": [{"value": first, "completion": done}, {"value": 1}]}
+        player = make_env_function(options(build, tmp_path, params={"scale": scale}))(5)
+        scene: Any = make_env_function(EnvConfig(num_areas=2, params={"scale": scale}))(5)
+        later = Sampler("multirangeuniform", (0.5, 0.75, 3.0, 3.5))
+
+        sizes = set()
+        with contextlib.closing(player):
+            for env in (player, scene):
+                env.reset()
+            for step in range(60):
+                mine, theirs = (env.get_steps(BALL)[0].obs[0] for env in (player, scene))
+                np.testing.assert_array_equal(mine, theirs)
+                for env in (player, scene):
+                    if step == 30:
+                        env.set_parameter("scale", later)
+                    env.reset() if step == 40 else act_and_step(env)
+                sizes |= set(scene.scale.tolist())
+        assert len(sizes) > 3 and max(sizes) > 2
+
+    def test_several_players_and_a_restarted_one_are_told_a_new_value(
+        self, build: str, tmp_path: Path
+    ) -> None:
+        cfg = options(
+            build, tmp_path, num_players=2, params={"scale": {"sampler": "uniform", "min": 1, "max": 2}}
+        )
+        players = make_env_function(cfg)(5)
+        assert isinstance(players, SeveralPlayers)
+        with contextlib.closing(players):
+            players.reset()
+            players.set_parameter("scale", 3.0)
+            process = players.players[1].player.process
+            assert process is not None
+            process.kill()
+            act_and_step(players)
+            assert players.restarts == 1
+        for number in range(2):
+            assert "environment parameter scale = 3" in (tmp_path / f"logs/Player-{number}.log").read_text()
 
     def test_the_same_seed_gives_the_embedded_trajectory(self, build: str, tmp_path: Path) -> None:
         player = make_env_function(options(build, tmp_path, params={"mass": 2.0}))(7)
@@ -624,7 +667,7 @@ class TestOptions:
             ({"screen_width": 80}, "env.screen_width and env.screen_height belong together"),
             (
                 {"backend": Backend.editor, "params": {"mass": "big"}},
-                "env.params.mass='big' must be a number",
+                "env.params.mass=big must be a number, a sampler",
             ),
         ],
     )

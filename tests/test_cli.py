@@ -430,7 +430,7 @@ def test_evaluation_prints_a_table_and_one_line_of_json(
     module = ModuleType("mappo_unity.policies.evaluate")
     vars(module)["evaluate"] = evaluate
     monkeypatch.setitem(sys.modules, "mappo_unity.policies.evaluate", module)
-    monkeypatch.setattr("mappo_unity.policies.first_checks.check_evaluation", lambda config: None)
+    monkeypatch.setattr("mappo_unity.policies.first_checks.check_evaluation", lambda *options: None)
     train_main(["hydra.run.dir=mine"])
     capsys.readouterr()
     assert eval_main(["run=mine", "episodes=20", "deterministic=true"]) == 0

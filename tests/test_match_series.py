@@ -39,7 +39,7 @@ def test_the_generator_that_draws_actions_is_restored(
     monkeypatch.setattr(torch, "manual_seed", lambda seed: calls.append(seed))
     monkeypatch.setattr(match_series, "play_matches", lambda *args: {"blue": Score(wins=1)})
     series = make_series(tmp_path, device)
-    series.play(10, {}, {})
+    series.play(series._cfg.env, 10, {}, {})
     assert calls == [kept, series._cfg.seed + 10]
 
 
@@ -52,7 +52,7 @@ def play_all(series: MatchSeries, monkeypatch: pytest.MonkeyPatch, wins: list[in
 
     scores = []
     for index in range(len(wins)):
-        series.play(10 * (index + 1), {}, {})
+        series.play(series._cfg.env, 10 * (index + 1), {}, {})
         scores.append(series.score(10 * (index + 1)))
     return scores
 

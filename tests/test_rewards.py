@@ -33,7 +33,7 @@ from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.rewards.curiosity import Curiosity
 from mappo_unity.learning.rewards.rnd import RandomNetwork
 from mappo_unity.learning.rewards.streams import IntrinsicStream, RewardStreams
-from mappo_unity.learning.rewards.transitions import Transitions, find_transitions
+from mappo_unity.learning.transitions import Transitions, find_transitions
 from mappo_unity.learning.value_norm import ValueNorm, by_stream
 from mappo_unity.runs import checkpoint
 from mappo_unity.training.setup import set_up

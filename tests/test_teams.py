@@ -137,9 +137,9 @@ def test_joint_branches_are_the_same_actions_under_one_categorical():
 
 def test_options_of_one_behavior():
     cfg = Config(behaviors={"Goalie": {"ppo": {"lr": 1e-5}, "model": {"hidden": [7]}}})
-    model, ppo = behavior_config(cfg, "Goalie")
+    model, ppo, *_ = behavior_config(cfg, "Goalie")
     assert (model.hidden, ppo.lr, ppo.gamma) == ([7], 1e-5, cfg.ppo.gamma)
-    assert behavior_config(cfg, "Striker") == (cfg.model, cfg.ppo)
+    assert behavior_config(cfg, "Striker") == (cfg.model, cfg.ppo, cfg.rewards, cfg.bc)
     check_behaviors(cfg, ["Goalie", "Striker"])
 
 

@@ -20,17 +20,19 @@ def run(lines: list[str]) -> int:
     """Play; print a table and one line of JSON; return the exit code."""
     with interrupts_end("mappo-eval"):
         from mappo_unity.config.compose import compose_plain
+        from mappo_unity.config.plain_options import take_parameters
         from mappo_unity.policies.first_checks import check_evaluation
 
+        params, lines = take_parameters(lines)
         config = compose_plain(lines, EvalConfig)
-        check_evaluation(config)
+        check_evaluation(config, params)
         options = vars(config)
         where = Path(options.pop("run"))
 
         # torch comes only now: mistakes in the options are told at once
         from mappo_unity.policies.evaluate import evaluate
 
-    result: dict[str, Any] = evaluate(where, **options)
+    result: dict[str, Any] = evaluate(where, **options, params=params)
     from mappo_unity.cli import report
 
     report.console().print(report.eval_table(result))

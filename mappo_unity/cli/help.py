@@ -38,8 +38,9 @@ Usage:
   mappo-eval run=FILE.onnx [env=NAME ...]   an ONNX file, or a folder of them (NAME.onnx for each behavior)
   mappo-eval --help | --version
 
-Example:
+Examples:
   mappo-eval run=outputs/3DBall/2026-11-20_12-00-00 episodes=100 deterministic=true
+  mappo-eval run=outputs/3DBall/2026-11-20_12-00-00 env.params.mass=10   environment parameters of its scene
 """
 
 PLAY_USAGE = """\

@@ -29,6 +29,8 @@ from mappo_unity.config.overrides import (
     given_options,
     parse,
 )
+from mappo_unity.config.parameters.curriculum import is_curriculum
+from mappo_unity.config.parameters.samplers import is_sampler
 from mappo_unity.config.plain_options import check_form
 from mappo_unity.config.presets import NO_CHOICE, conf_dir, group_choices
 from mappo_unity.config.renamed import rename_keys
@@ -75,6 +77,7 @@ def compose_config(lines: list[str], base: Path | None = None, file: Path | None
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
             tree = compose(name, lines, return_hydra_config=True)
+            _keep_parameters_whole(tree, lines)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error)) from error
 
@@ -171,6 +174,26 @@ def compose_plain(lines: list[str], schema: type) -> Any:
 def check_effect(lines: list[str], configs: list[Config]) -> None:
     """Refuse options on the command line that none of the runs it stands for looks at; raise ConfigError."""
     backend_options.check_effect(given_options(lines), configs)
+
+
+def _keep_parameters_whole(tree: DictConfig, lines: list[str]) -> None:
+    """Put samplers and curricula of the command line in the place of others, whose keys Hydra mixes in."""
+    root = "env.params"
+    for override in parse(lines):
+        key = override.key_or_group
+        value: Any = override.value()
+        if override.is_delete() or key != root and not key.startswith(f"{root}."):
+            continue
+
+        name = key[len(root) + 1 :]
+        if "." in name:  # one key of a parameter, as given behind the whole
+            OmegaConf.update(tree, key, value, force_add=True)
+            continue
+
+        for parameter, raw in ({name: value} if name else value or {}).items():
+            if is_sampler(raw) or is_curriculum(raw):
+                with open_dict(tree):
+                    tree.env.params[parameter] = raw
 
 
 def _resumed_root(base: Path) -> dict[Any, Any]:

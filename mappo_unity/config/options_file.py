@@ -19,7 +19,7 @@ from mappo_unity.errors import ConfigError
 
 SWITCH = "--config"
 _SUFFIXES = (".yaml", ".yml")
-_CHOICES = ("env", "recipe")  # groups that a file may choose by name
+_CHOICES = ("env", "parameters", "recipe")  # groups that a file may choose by name
 
 
 def take_file(lines: list[str]) -> tuple[list[str], Path | None]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mappo_unity.config.schema import Config, ModelConfig, PPOConfig, RewardsConfig
+from mappo_unity.config.schema import BCConfig, Config, ModelConfig, PPOConfig, RewardsConfig
 from mappo_unity.errors import ConfigError
 
 
@@ -20,6 +20,7 @@ class BehaviorConfig(NamedTuple):
     model: ModelConfig
     ppo: PPOConfig
     rewards: RewardsConfig
+    bc: BCConfig
 
 
 def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:

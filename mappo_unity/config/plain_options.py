@@ -58,6 +58,19 @@ def check_form(lines: Sequence[str], schema: type) -> None:
             )
 
 
+def take_parameters(lines: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the lines that set environment parameters, in mappo-train's grammar, and all others.
+
+    Raises:
+        ConfigError: one has several values.
+    """
+    own = [line for line in lines if re.match(r"env\.params[.=]", line)]
+    for override, line in zip(parse(own), own):
+        if override.is_sweep_override():
+            raise ConfigError(f"{line}: {override.key_or_group} takes one value here")
+    return own, [line for line in lines if line not in own]
+
+
 def _check_other_command(key: str, schema: type, table: dict[str, Option]) -> None:
     """Raise ConfigError for an option that another command has."""
     tables = {name: option_table(other) for name, other in _COMMANDS.items() if other is not schema}

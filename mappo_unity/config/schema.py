@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Optional
 
+from mappo_unity.config.parameters.values import FACTORY, PLAYERS, SCENE, read_parameters
 from mappo_unity.errors import ConfigError
 
 
@@ -163,7 +164,8 @@ class EnvConfig:
     num_areas: Optional[int] = field(default=None, metadata=_ANY_BUT_CUSTOM)
     """Copies of the playing area inside one environment; null: as many as the Unity scene has."""
     params: dict[str, Any] = field(default_factory=dict)
-    """Environment parameters (env.params.mass=2) of the scene or player, or arguments of env.factory."""
+    """Environment parameters (env.params.mass=2) of the scene or player, or arguments of env.factory. Also a
+    sampler, {sampler: uniform, min: 0.5, max: 10}, or a curriculum, {lessons: [...]}."""
     factory: Optional[str] = field(default=None, metadata={BACKENDS: (Backend.custom,)})
     """With backend=custom: package.module:function, called as function(seed=..., **env.params)."""
     file_name: Optional[str] = field(default=None, metadata={BACKENDS: (Backend.player,)})
@@ -224,6 +226,7 @@ class EnvConfig:
             _within("env.port", self.port, 1, 65535)
 
         self._check_players()
+        _ = self.parameters  # which looks for mistakes
 
         if self.backend is Backend.custom and not self.factory:
             raise ConfigError(
@@ -250,12 +253,11 @@ class EnvConfig:
                 f"env.backend={self.backend.value} there is one environment{larger}"
             )
 
-        if self.backend in (Backend.player, Backend.editor, Backend.registry):
-            for name, value in self.params.items():
-                if isinstance(value, bool) or not isinstance(value, (int, float)):
-                    raise ConfigError(
-                        f"env.params.{name}={value!r} must be a number: players take float parameters only"
-                    )
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What env.params says, read: see `read_parameters`; raises ConfigError."""
+        takers = {Backend.embedded: SCENE, Backend.custom: FACTORY}
+        return read_parameters(self.params, takers.get(self.backend, PLAYERS))
 
 
 LOG_STD_RANGE = (-5, 2)
@@ -503,6 +505,59 @@ class RNDConfig:
 
 
 @dataclass
+class GAILConfig:
+    """Reward for what a discriminator takes for the demonstrations' (GAIL, arXiv 1606.03476)."""
+
+    strength: float = 0.0
+    """Factor of the reward; 0: this stream is off."""
+    gamma: float = 0.99
+    """Discount of the reward."""
+    lr: float = 3e-4
+    """Learning rate of the discriminator."""
+    hidden: list[int] = field(default_factory=lambda: [128, 128])
+    """Widths of the discriminator's layers."""
+    demos: list[str] = field(default_factory=list)
+    """Unity's .demo files, or folders of them."""
+    use_actions: bool = False
+    """Judge observations with actions and ends; false: observations alone."""
+    use_vail: bool = False
+    """Let the discriminator see features through a bottleneck (VAIL, arXiv 1810.00821)."""
+    normalize: bool = False
+    """Divide the reward by the running deviation of its discounted sums."""
+
+    def __post_init__(self) -> None:
+        _check_intrinsic("rewards.gail", self)
+        if self.strength > 0 and not self.demos:
+            raise ConfigError(
+                f"rewards.gail.strength={self.strength:g} needs demonstrations: "
+                "rewards.gail.demos=[expert.demo]"
+            )
+
+
+@dataclass
+class BCConfig:
+    """Behavioral cloning: the policy learns to do what demonstrations show."""
+
+    demos: list[str] = field(default_factory=list)
+    """Unity's .demo files, or folders of them; none: nothing is cloned."""
+    strength: float = 1.0
+    """Learning rate of cloning in units of the policy's (ppo.lr)."""
+    steps: int = 0
+    """Agent decisions over which the strength falls to 0; 0: it stays."""
+    only: bool = False
+    """Learn from the demonstrations alone: they are played back instead of the environment, which is not
+    opened."""
+
+    def __post_init__(self) -> None:
+        _above("bc.strength", self.strength, 0)
+        _at_least("bc.steps", self.steps, 0)
+        if self.only and not self.demos:
+            raise ConfigError("bc.only=true needs demonstrations: bc.demos=[expert.demo]")
+        if self.only and self.steps:
+            raise ConfigError(f"bc.steps={self.steps} does not go with bc.only=true: nothing would be left")
+
+
+@dataclass
 class RewardsConfig:
     """Streams of rewards, each with a discount and a value of its own; their advantages are summed."""
 
@@ -512,11 +567,13 @@ class RewardsConfig:
     """Reward for what a model of the environment does not foresee."""
     rnd: RNDConfig = field(default_factory=RNDConfig)
     """Reward for observations that are new."""
+    gail: GAILConfig = field(default_factory=GAILConfig)
+    """Reward for what a discriminator takes for the demonstrations'."""
 
     @property
     def intrinsic(self) -> dict[str, Any]:
         """The streams beside the environment's that are on, by name."""
-        streams = {"curiosity": self.curiosity, "rnd": self.rnd}
+        streams = {"curiosity": self.curiosity, "rnd": self.rnd, "gail": self.gail}
         return {name: stream for name, stream in streams.items() if stream.strength > 0}
 
 
@@ -581,6 +638,8 @@ class Config:
     """The learner."""
     rewards: RewardsConfig = field(default_factory=RewardsConfig)
     """Streams of rewards beside the environment's own."""
+    bc: BCConfig = field(default_factory=BCConfig)
+    """Behavioral cloning from demonstrations."""
     collect: CollectConfig = field(default_factory=CollectConfig)
     """Collecting experience."""
     matches: MatchConfig = field(default_factory=MatchConfig)
@@ -589,7 +648,7 @@ class Config:
     """Metrics and progress."""
     behaviors: dict[str, Any] = field(default_factory=dict)
     """Options of one behavior name: behaviors.Goalie.ppo.lr=1e-4 overrides ppo.lr for Goalie; sections
-    ppo, model and rewards."""
+    ppo, model, rewards and bc."""
     seed: int = 0
     """Seed of the environment, the networks and the sampling."""
     max_steps: int = 1_000_000
@@ -718,7 +777,7 @@ def _not_empty(**options: Optional[str]) -> None:
             raise ConfigError(f"{name}= is empty: give it a value, or leave it out")
 
 
-def _check_intrinsic(section: str, cfg: CuriosityConfig | RNDConfig) -> None:
+def _check_intrinsic(section: str, cfg: CuriosityConfig | RNDConfig | GAILConfig) -> None:
     _at_least(f"{section}.strength", cfg.strength, 0)
     _within(f"{section}.gamma", cfg.gamma, 0, 1)
     _above(f"{section}.lr", cfg.lr, 0)

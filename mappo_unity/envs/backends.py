@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from mappo_unity.config.parameters.values import later_values, values_at
 from mappo_unity.config.schema import Backend, EnvConfig
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.ports import EDITOR_PORT
@@ -26,7 +27,7 @@ PLAYER_STRIDE = 100_003
 
 
 def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv:
-    """Return the function that opens the environment for a seed.
+    """Return the function that opens the environment for a seed; parameters are at their first lessons.
 
     Args:
         log_folder: where players write their logs, unless env.player_logs says; None: a temporary folder.
@@ -49,12 +50,15 @@ def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv
 def _embedded(cfg: EnvConfig) -> MakeEnv:
     from mappo_unity.scenes.registry import BUILT_IN, make_scene
 
-    params = dict(cfg.params)
+    parameters = cfg.parameters
+    params = values_at(parameters, {})
     if cfg.num_areas is not None:
         params["num_areas"] = cfg.num_areas
 
     def make(seed: int) -> BaseEnv:
         scene = make_scene(cfg.name, seed=seed, **params)
+        for name, value in later_values(parameters):
+            scene.parameters.check(name, value)
 
         if cfg.name in BUILT_IN:
             return scene
@@ -82,7 +86,7 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
             arguments=list(cfg.player_args),
             no_graphics=cfg.no_graphics,
             num_areas=cfg.num_areas or 1,
-            parameters={name: float(value) for name, value in cfg.params.items()},
+            parameters=values_at(cfg.parameters, {}),
             engine=_engine(cfg),
         )
 
@@ -168,5 +172,5 @@ def _describe(cfg: EnvConfig) -> str:
 
 def _custom(cfg: EnvConfig) -> MakeEnv:
     name = f"env.factory={cfg.factory}"
-    factory = load_factory(str(cfg.factory), name)
-    return lambda seed: GuardedEnv(call_factory(factory, name, seed, cfg.params), name, explain_error)
+    factory, params = load_factory(str(cfg.factory), name), values_at(cfg.parameters, {})
+    return lambda seed: GuardedEnv(call_factory(factory, name, seed, params), name, explain_error)

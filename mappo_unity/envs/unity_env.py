@@ -20,6 +20,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from mappo_unity import keys
+from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.envs.actions import action_tuple
 from mappo_unity.envs.opening import first_results, team_sizes
 from mappo_unity.envs.rounds import BehaviorState, Episode
@@ -106,6 +107,20 @@ class UnityEnv(EnvBase):
         out: list[CrashedEpisodes] = self._crashed
         self._crashed = []
         return out
+
+    @property
+    def takes_parameters(self) -> bool:
+        """Whether the BaseEnv's environment parameters can be set while it plays."""
+        return hasattr(self.base_env, "set_parameter")
+
+    def set_parameter(self, name: str, value: Value) -> None:
+        """Set an environment parameter; the environment decides when it takes effect."""
+        self.base_env.set_parameter(name, value)
+
+    def restart(self) -> None:
+        """Reset the scene, also right after another reset; all episodes are cut."""
+        self._untouched = False
+        self._full_reset()
 
     def get_state(self) -> dict[str, Any] | None:
         """Return a snapshot between two rounds, or None if the BaseEnv cannot give one."""

@@ -20,6 +20,7 @@ from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import ActionDistribution
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import RecurrentCritic
+from mappo_unity.learning.value_norm import ValueNorm
 
 ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: it acted, and the outcome is known; absent: all
 CRITIC_LEARNS = "critic_learns"  # bool [rows, A, 1]: the same, or it departed while a team mate acted
@@ -142,3 +143,13 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         if self.cfg.value_loss is ValueLoss.huber:
             return huber_loss(value, target, reduction="none", delta=self.cfg.huber_delta)
         return (value - target) ** 2
+
+
+@torch.no_grad()
+def move_with_minibatch(norm: ValueNorm, rows: TensorDictBase) -> None:
+    """Take a minibatch's targets into the statistics and normalise its values by them, in place."""
+    targets, learns = rows.get(keys.VALUE_TARGET), rows.get(CRITIC_LEARNS, None)
+    norm.update(targets.flatten(0, -2) if learns is None else targets[learns.squeeze(-1)])
+    for key in (keys.VALUE_TARGET, keys.VALUE, BASELINE):
+        if key in rows.keys():
+            rows.set(key, norm.normalize(rows.get(key)))

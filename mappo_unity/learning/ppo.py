@@ -29,7 +29,14 @@ from mappo_unity.learning.advantage import (
     value_metrics,
 )
 from mappo_unity.learning.carried import VALUED, CarriedRounds, has_value
-from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS, MaskedClipPPOLoss
+from mappo_unity.learning.imitation.cloning import Cloning
+from mappo_unity.learning.loss import (
+    ACTOR_LEARNS,
+    BASELINE,
+    CRITIC_LEARNS,
+    MaskedClipPPOLoss,
+    move_with_minibatch,
+)
 from mappo_unity.learning.minibatches import make_buffer
 from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
 from mappo_unity.learning.networks.encoders import RunningNorm
@@ -53,6 +60,7 @@ class PolicyLearner:
         actor, critic: see `learning.networks.actor_critic`; both have a memory, or neither.
         cfg: the learner's options.
         rewards: the streams that the critic has values for; None: the environment's rewards alone.
+        cloning: of demonstrations, beside PPO or alone; None: there are none.
     """
 
     def __init__(
@@ -61,9 +69,10 @@ class PolicyLearner:
         critic: TensorDictModule,
         cfg: PPOConfig,
         rewards: RewardStreams | None = None,
+        cloning: Cloning | None = None,
     ) -> None:
         self.actor, self.critic, self.cfg = actor, critic, cfg
-        self.rewards = rewards or RewardStreams(cfg)
+        self.rewards, self.cloning = rewards or RewardStreams(cfg), cloning
         actor.keeps_components = cfg.ratio is RatioKind.component
         self.loss = MaskedClipPPOLoss(actor, critic, cfg)
         self.optimizer = make_optimizer(actor, critic, cfg)
@@ -95,9 +104,13 @@ class PolicyLearner:
             Metrics.
         """
         settings = self._set_schedules(progress)
-        buffer, metrics = self.prepare(batch)
-        metrics |= self.update(buffer) if buffer is not None else {}
-        metrics |= self.rewards.learn()
+        metrics: dict[str, float] = {}
+        if self.cloning is None or not self.cloning.cfg.only:
+            buffer, metrics = self.prepare(batch)
+            metrics |= self.update(buffer) if buffer is not None else {}
+            metrics |= self.rewards.learn()
+        if self.cloning is not None:
+            metrics |= self.cloning.learn(int(batch.get(keys.ACTING).sum()), settings["lr"], progress)
         self._update_norms(batch)
         return metrics | settings
 
@@ -215,7 +228,7 @@ class PolicyLearner:
     def step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         """Take one step of the optimizer; return its terms, as they were before it."""
         if self.cfg.value_norm_update is ValueNormUpdate.minibatch:
-            self._normalize_values(minibatch)
+            move_with_minibatch(self.value_norm, minibatch)
         losses = self.loss(minibatch)
         total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
 
@@ -243,15 +256,6 @@ class PolicyLearner:
         """Return the approximate KL on the last minibatch, now that its step is taken."""
         self.loss.compare(minibatch)
         return approximate_kl(self.loss.log_ratio, self.loss.ratio, minibatch.get(ACTOR_LEARNS, None))
-
-    @torch.no_grad()
-    def _normalize_values(self, minibatch: TensorDictBase) -> None:
-        """Take a minibatch's targets into the statistics and normalise its values by them."""
-        targets, learns = minibatch.get(keys.VALUE_TARGET), minibatch.get(CRITIC_LEARNS, None)
-        self.value_norm.update(targets.flatten(0, -2) if learns is None else targets[learns.squeeze(-1)])
-        for key in (keys.VALUE_TARGET, keys.VALUE, BASELINE):
-            if key in minibatch.keys():
-                minibatch.set(key, self.value_norm.normalize(minibatch.get(key)))
 
     @torch.no_grad()
     def _update_norms(self, batch: TensorDictBase) -> None:
@@ -283,6 +287,7 @@ class PolicyLearner:
             "carried": self.carried.state_dict(),
             "critic_states": self.reader.state_dict(),
             "rewards": self.rewards.state_dict(),
+            "cloning": None if self.cloning is None else self.cloning.state_dict(),
             "updates": self.updates,
             "rollbacks": self.rollbacks,
         }
@@ -292,6 +297,8 @@ class PolicyLearner:
         self._load_trainable(state)
         self.value_norm.load_state_dict(by_stream(state["value_norm"]))
         self.rewards.load_state_dict(state.get("rewards", {}))
+        if self.cloning is not None and state.get("cloning") is not None:
+            self.cloning.load_state_dict(state["cloning"])
         self.carried.load_state_dict(state.get("carried"), self.params[0].device)
         self.reader.load_state_dict(state.get("critic_states", {}))
         self.rollbacks = int(state["rollbacks"])

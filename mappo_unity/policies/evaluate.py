@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from mappo_unity.config.parameters.samplers import Sampler
+from mappo_unity.config.schema import EnvConfig
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.episodes import play, summarize
 from mappo_unity.policies.matches import Score, play_matches
 from mappo_unity.policies.onnx_policy import OnnxFolder, OnnxPolicy
 from mappo_unity.policies.policy import CheckpointPolicy, Policy, RandomPolicy
-from mappo_unity.policies.policy_files import Kind, choose_checkpoint, locate
+from mappo_unity.policies.policy_files import Kind, at_its_lessons, choose_checkpoint, locate
 from mappo_unity.runs.options import config_to_play
 
 
@@ -23,6 +26,7 @@ def evaluate(
     seed: int = 0,
     opponent: str | None = None,
     env: str | None = None,
+    params: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Play a run's policy in its own environment, or in another.
 
@@ -31,6 +35,8 @@ def evaluate(
         episodes: agent episodes of every behavior; with an opponent, matches.
         opponent: "random", or another run, checkpoint or ONNX file, for environments with two sides.
         env: preset of the environment; None = that of the run.
+        params: lines such as env.params.mass=2; what they leave out has the values of the run, a curriculum
+            those of the lesson that the checkpoint had reached.
 
     Returns:
         Figures for the table and the JSON line of mappo-eval.
@@ -42,15 +48,11 @@ def evaluate(
     torch.manual_seed(seed)
 
     policy = open_policy(str(run), deterministic, seed)
-    make_env = make_env_function(config_to_play(run, env).env)
+    options = at_its_lessons(config_to_play(run, env, params).env, str(run))
+    make_env = make_env_function(options)
 
     head = {"policy": str(getattr(policy, "path", run)), "deterministic": deterministic, "seed": seed}
-    head |= (
-        {"agent_steps": policy.agent_steps}
-        if isinstance(policy, (CheckpointPolicy, OnnxPolicy, OnnxFolder))
-        else {}
-    )
-
+    head |= _more_head(policy, options)
     if opponent is not None:
         other = open_policy(opponent, deterministic, seed, "opponent")
         scores = play_matches(make_env, policy, other, episodes, seed)
@@ -65,6 +67,17 @@ def evaluate(
     # The figures of a single behavior stand at the top, those of several below their names.
     behaviors = {name: summarize(rows) for name, rows in finished.items()}
     return head | (next(iter(behaviors.values())) if len(behaviors) == 1 else {"behaviors": behaviors})
+
+
+def _more_head(policy: Policy, env: EnvConfig) -> dict[str, Any]:
+    """Return what a policy says of its training, and the environment parameters in force."""
+    head: dict[str, Any] = {}
+    if isinstance(policy, (CheckpointPolicy, OnnxPolicy, OnnxFolder)):
+        head["agent_steps"] = policy.agent_steps
+    if env.params:
+        values = env.parameters.items()
+        head["env.params"] = {n: str(value) if isinstance(value, Sampler) else value for n, value in values}
+    return head
 
 
 def match_figures(scores: dict[str, Score]) -> dict[str, Any]:

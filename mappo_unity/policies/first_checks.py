@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,15 +34,15 @@ _FILE_ENDING = re.compile(rf"\.(?!{SUFFIX[1:]}$)[A-Za-z][A-Za-z0-9]{{0,3}}")
 """An ending of files other than ONNX files; that of a folder such as exports.v1.2 is none."""
 
 
-def check_evaluation(cfg: EvalConfig) -> None:
-    """Raise ConfigError if nothing can be evaluated with these options."""
+def check_evaluation(cfg: EvalConfig, params: Sequence[str] = ()) -> None:
+    """Raise ConfigError if nothing can be evaluated with these options; `params`: see `config_to_play`."""
     check_mujoco()
     sources = [locate(cfg.run, "run")]
     if cfg.opponent is not None:
         sources.append(locate(cfg.opponent, "opponent"))
     known = [_open(source, cfg.deterministic) for source in sources]
 
-    config = _environment(sources[0], known[0], cfg.env, "mappo-eval")
+    config = _environment(sources[0], known[0], cfg.env, "mappo-eval", params)
     try:
         check_environment(config)
     except ConfigError as error:
@@ -154,7 +154,9 @@ def _open(source: Source, deterministic: bool) -> Any:
     return check_checkpoint(source)
 
 
-def _environment(source: Source, known: Any, env: str | None, command: str) -> Config:
+def _environment(
+    source: Source, known: Any, env: str | None, command: str, params: Sequence[str] = ()
+) -> Config:
     """Return the options of the environment to play in; see `config_to_play`."""
     scenes = [name for name in group_choices()["env"] if name in scene_names()]
 
@@ -174,7 +176,7 @@ def _environment(source: Source, known: Any, env: str | None, command: str) -> C
             "env out and name a run of that environment, or a file in its folder, and its own options count"
         )
 
-    return config_to_play(source.path, env)
+    return config_to_play(source.path, env, params)
 
 
 def _lies_in_run(source: Source) -> bool:

@@ -8,12 +8,14 @@ from __future__ import annotations
 import logging
 import os
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from mappo_unity.config.overrides import shell_argument
+from mappo_unity.config.parameters.values import params_at
+from mappo_unity.config.schema import EnvConfig
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.checkpoint_file import (
     BEST,
@@ -127,6 +129,17 @@ def check_checkpoint(source: Source) -> dict[str, Any]:
         if not others:
             raise
         raise CheckpointError(f"{error}; its run has others: {', '.join(others)}") from error
+
+
+def at_its_lessons(env: EnvConfig, policy: str) -> EnvConfig:
+    """Return the options of an environment at the lessons that a policy had reached.
+
+    The lessons are those of its checkpoint; what holds none (an ONNX file) plays the last ones.
+    """
+    source = locate(policy, "run")
+    is_checkpoint = source.kind in (Kind.run, Kind.checkpoint)
+    saved = check_checkpoint(source).get("lessons", {}) if is_checkpoint else {}
+    return replace(env, params=params_at(env.params, saved.get("numbers", {}), missing=-1))
 
 
 def _folder(path: Path, option: str) -> Source:

@@ -17,9 +17,9 @@ from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, Decisi
 from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
 from mlagents_envs.side_channel import SideChannel
 from mlagents_envs.side_channel.engine_configuration_channel import EngineConfigurationChannel
-from mlagents_envs.side_channel.environment_parameters_channel import EnvironmentParametersChannel
 from mlagents_envs.side_channel.side_channel_manager import SideChannelManager
 
+from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.decode import ActionEncoder, BehaviorDecoder, MalformedMessage, behavior_spec
 from mappo_unity.protocol.messages import STATUS_OK
@@ -32,6 +32,7 @@ from mappo_unity.protocol.player_failures import (
 from mappo_unity.protocol.player_options import PlayerOptions
 from mappo_unity.protocol.process import PlayerProcess
 from mappo_unity.protocol.server import Link, LinkTimeout
+from mappo_unity.protocol.side_channels import ParametersChannel
 from mappo_unity.scenes.contract.images import sends_channels_last
 
 CLOSE_S = 5.0  # how long a player may take to leave before it is killed
@@ -56,19 +57,17 @@ class UnityPlayer(BaseEnv):
     ) -> None:
         self.options, self.seed = options, seed
 
-        parameters, engine = EnvironmentParametersChannel(), EngineConfigurationChannel()
-        engine.set_configuration_parameters(**options.engine)
-        self._engine = engine
+        self._parameters, self._engine = ParametersChannel(), EngineConfigurationChannel()
+        self._channels = SideChannelManager([self._parameters, self._engine, *(side_channels or [])])
+        self._engine.set_configuration_parameters(**options.engine)
         for name, value in options.parameters.items():
-            parameters.set_float_parameter(name, value)
-        self._channels = SideChannelManager([parameters, engine, *(side_channels or [])])
+            self.set_parameter(name, value)
 
         self._decoders: dict[str, BehaviorDecoder] = {}
         self._encoders: dict[str, ActionEncoder] = {}
         self._steps: dict[str, tuple[DecisionSteps, TerminalSteps]] = {}
         self._actions: dict[str, ActionTuple] = {}
-        self._open = True
-        self._was_reset = False
+        self._open, self._was_reset = True, False
         self.handshake: Any = None
         """The player's UnityRLInitializationOutputProto, once connected."""
         self.process: PlayerProcess | None = None
@@ -96,11 +95,8 @@ class UnityPlayer(BaseEnv):
             ProtocolMismatch: it speaks another version; also a ConfigError.
         """
         if self.process is None:
-            logger.warning(
-                "waiting %g s for the Unity Editor on port %d: press Play",
-                self.options.timeout_s,
-                self._link.port,
-            )
+            wait = "waiting %g s for the Unity Editor on port %d: press Play"
+            logger.warning(wait, self.options.timeout_s, self._link.port)
 
         output = self._receive()
         self.handshake = output.rl_initialization_output
@@ -148,6 +144,10 @@ class UnityPlayer(BaseEnv):
                 self._channels.process_side_channel_message(output.rl_output.side_channel)
         except (MalformedMessage, UnityEnvironmentException, ValueError, IndexError) as error:
             raise self._failure(f"sent a malformed message: {error}") from error
+
+    def set_parameter(self, name: str, value: Value) -> None:
+        """Set an environment parameter of the player, with its next step."""
+        self._parameters.send(name, value, self.seed)
 
     def set_time_scale(self, scale: float) -> None:
         """Let the player run so much faster than real time, from the next step on."""

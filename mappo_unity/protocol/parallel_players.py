@@ -12,6 +12,7 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 from mlagents_envs.exception import UnityActionException
 
+from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.protocol.restarting_player import RestartingPlayer
 
 
@@ -85,6 +86,11 @@ class SeveralPlayers(BaseEnv):
         """Set the action of one agent in the last decision steps."""
         inner, p = divmod(agent_id, len(self.players))
         self.players[p].set_action_for_agent(behavior_name, inner, action)
+
+    def set_parameter(self, name: str, value: Value) -> None:
+        """Set an environment parameter of all players, with their next step."""
+        for player in self.players:
+            player.set_parameter(name, value)
 
     def close(self) -> None:
         """Close all players."""

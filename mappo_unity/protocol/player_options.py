@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mappo_unity.config.parameters.samplers import Value
+
 
 @dataclass
 class PlayerOptions:
@@ -18,7 +20,7 @@ class PlayerOptions:
     arguments: list[str] = field(default_factory=list)
     no_graphics: bool = False
     num_areas: int = 1
-    parameters: dict[str, float] = field(default_factory=dict)
+    parameters: dict[str, Value] = field(default_factory=dict)
     engine: dict[str, Any] = field(default_factory=dict)
     """Arguments of EngineConfigurationChannel.set_configuration_parameters."""
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 
+from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.protocol.client import MakePlayer, UnityPlayer
 from mappo_unity.protocol.player_failures import PlayerFailure
@@ -52,6 +53,7 @@ class RestartingPlayer(BaseEnv):
         self._failures_in_a_row = self._good_steps = 0
         self._last: dict[str, dict[int, DecisionSteps]] = {}  # newest decision of every agent that plays
         self._crashed_steps: dict[str, TerminalSteps] = {}
+        self._parameters: dict[str, Value] = {}  # set since the first player was started
         self._specs = BehaviorMapping({})
 
         self.player: UnityPlayer = make_player(seed)
@@ -71,6 +73,11 @@ class RestartingPlayer(BaseEnv):
         """Tell the player to reset its scene."""
         self.player.send_reset()
         self._last.clear()
+
+    def set_parameter(self, name: str, value: Value) -> None:
+        """Set an environment parameter of the player, with its next step, and of those that follow it."""
+        self._parameters[name] = value
+        self.player.set_parameter(name, value)
 
     def receive(self) -> None:
         """Wait for the result.
@@ -185,6 +192,8 @@ class RestartingPlayer(BaseEnv):
                 # the failed player needs no `close`: `UnityPlayer` ends itself before it raises
                 self.player = self._make_player((self._seed + SEED_STRIDE * self.restarts) % 2**31)
                 self.player.connect()
+                for name, value in self._parameters.items():
+                    self.player.set_parameter(name, value)
                 self.player.reset()
             except PlayerFailure as error:
                 failure = error

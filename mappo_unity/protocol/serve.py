@@ -24,6 +24,8 @@ from mlagents_envs.base_env import BaseEnv  # noqa: E402
 
 from mappo_unity import __version__  # noqa: E402
 from mappo_unity.config.option_table import did_you_mean  # noqa: E402
+from mappo_unity.config.parameters.samplers import Sampler, Value  # noqa: E402
+from mappo_unity.config.parameters.values import show_parameter  # noqa: E402
 from mappo_unity.protocol import encode, messages, side_channels  # noqa: E402
 from mappo_unity.protocol.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
 from mappo_unity.protocol.ports import EDITOR_PORT  # noqa: E402
@@ -251,15 +253,20 @@ class Player:
             elif channel != side_channels.ANALYTICS:
                 self.log(f"a message on side channel {channel}, which this player does not know")
 
-    def _set_parameter(self, name: str, value: float) -> None:
+    def _set_parameter(self, name: str, value: Value) -> None:
+        from mappo_unity.scenes.core.scene import Scene
+
         setter = getattr(self.env, "set_parameter", None)
+        shown = show_parameter(value)
         try:
             if setter is None:
                 raise ConfigError("the environment takes no parameters")
+            if isinstance(value, Sampler) and not isinstance(self.env, Scene):
+                raise ConfigError("only scenes draw from samplers; this environment takes numbers")
             setter(name, value)
-            self.log(f"environment parameter {name} = {value:g}")
+            self.log(f"environment parameter {name} = {shown}")
         except ConfigError as error:  # Unity accepts any name, too
-            self.log(f"environment parameter {name} = {value:g} is ignored: {error}")
+            self.log(f"environment parameter {name} = {shown} is ignored: {error}")
 
 
 def _say_goodbye(exchange: Callable[..., bytes], text: str) -> None:

@@ -1,4 +1,4 @@
-"""Side channels as a player reads them: environment parameters and engine settings.
+"""Side channels: environment parameters as a trainer sends them, and what a player reads of them.
 
 The layout of the messages is that of the outgoing side in mlagents_envs.side_channel.
 """
@@ -10,8 +10,10 @@ import uuid
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 from mlagents_envs.side_channel import IncomingMessage
+from mlagents_envs.side_channel.environment_parameters_channel import EnvironmentParametersChannel
+
+from mappo_unity.config.parameters.samplers import KINDS, SAMPLER, Sampler, Value, read_value
 
 PARAMETERS = uuid.UUID("534c891e-810f-11ea-a9d0-822485860400")
 """EnvironmentParametersChannel."""
@@ -42,26 +44,44 @@ def split(data: bytes) -> Iterator[tuple[uuid.UUID, IncomingMessage]]:
         at += 20 + size
 
 
-def read_parameter(message: IncomingMessage) -> tuple[str, float]:
-    """Return name and value of an environment parameter; a sampler is drawn from once, with its seed."""
+class ParametersChannel(EnvironmentParametersChannel):
+    """Environment parameters on their way to a player; sent with its next step, the newest last."""
+
+    def send(self, name: str, value: Value, seed: int) -> None:
+        """Send a number, or a sampler from which the player draws; `seed`: the player's."""
+        if not isinstance(value, Sampler):
+            self.set_float_parameter(name, value)
+            return
+
+        own_seed = value.seed_within(seed)
+        if value.kind == "uniform":
+            self.set_uniform_sampler_parameters(name, *value.numbers, own_seed)
+        elif value.kind == "gaussian":
+            self.set_gaussian_sampler_parameters(name, *value.numbers, own_seed)
+        else:
+            intervals = list(zip(value.numbers[::2], value.numbers[1::2]))
+            self.set_multirangeuniform_sampler_parameters(name, intervals, own_seed)
+
+
+def read_parameter(message: IncomingMessage) -> tuple[str, Value]:
+    """Return name and value of an environment parameter; raise ConfigError for a sampler that is none."""
     name = message.read_string()
     if message.read_int32() == 0:
         return name, message.read_float32()
 
-    # A sampler: its seed, its kind, its numbers.
-    rng = np.random.default_rng(message.read_int32() & 0x7FFFFFFF)
-
+    # a sampler: its seed, its kind, its numbers
+    raw: dict[str, Any] = {"seed": message.read_int32() & 0x7FFFFFFF}
     kind = message.read_int32()
-    if kind == 0:
-        return name, float(rng.uniform(message.read_float32(), message.read_float32()))
-    if kind == 1:
-        return name, float(rng.normal(message.read_float32(), message.read_float32()))
+    raw[SAMPLER] = KINDS[kind] if 0 <= kind < len(KINDS) else kind
 
-    # Several intervals: the wider one is, the likelier.
-    ends = np.array(message.read_float32_list()).reshape(-1, 2)
-    widths = ends[:, 1] - ends[:, 0]
-    low, high = ends[rng.choice(len(ends), p=widths / widths.sum())]
-    return name, float(rng.uniform(low, high))
+    if raw[SAMPLER] == "uniform":
+        raw |= {"min": message.read_float32(), "max": message.read_float32()}
+    elif raw[SAMPLER] == "gaussian":
+        raw |= {"mean": message.read_float32(), "st_dev": message.read_float32()}
+    elif raw[SAMPLER] == "multirangeuniform":
+        ends = message.read_float32_list()
+        raw["intervals"] = [ends[first : first + 2] for first in range(0, len(ends), 2)]
+    return name, read_value(f"environment parameter {name}", raw)
 
 
 def read_engine_setting(message: IncomingMessage) -> str:

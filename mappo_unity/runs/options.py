@@ -5,6 +5,7 @@ The module of env.factory may lie where the run found it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from mappo_unity.config.compose import check_effect, compose_config, load_config
@@ -54,14 +55,14 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
     return config
 
 
-def config_to_play(run: Path, env: str | None) -> Config:
+def config_to_play(run: Path, env: str | None, params: Sequence[str] = ()) -> Config:
     """Return the options of the environment in which a run or an ONNX file is played; raise ConfigError.
 
     `env` names a preset; without it it is that of the run's folder, or of the one the file lies in. Then the
-    module of env.factory may also lie where the run found it.
+    module of env.factory may also lie where the run found it. `params`: lines such as env.params.mass=2.
     """
     if env is not None:
-        return compose_config([f"env={quoted(env)}"]).config
+        return compose_config([f"env={quoted(env)}", *params]).config
 
     try:
         folder = find_run(run, "run")
@@ -73,6 +74,8 @@ def config_to_play(run: Path, env: str | None) -> Config:
         choices = ", ".join(group_choices()["env"])
         raise ConfigError(f"{error}; or say in which environment to play it: env=NAME ({choices})") from error
 
+    if params:
+        config = compose_config(list(params), folder / CONFIG).config
     if config.env.factory is not None:
         look_in(factory_folder(folder), config.env.factory, folder)
     return config

@@ -114,6 +114,7 @@ def describe(row: Mapping[str, int | float], max_steps: int, steps_per_s: float)
     `steps_per_s`: the speed that the time left is reckoned with.
     """
     steps = int(row["agent_steps"])
+    lessons = [f"{value:.0f}" for name, value in row.items() if name.startswith("lesson/")]
     left_s = max(max_steps - steps, 0) / steps_per_s if steps_per_s > 0 else math.nan
 
     return "  ".join(
@@ -122,6 +123,7 @@ def describe(row: Mapping[str, int | float], max_steps: int, steps_per_s: float)
             f"{_figure(row.get('steps_per_s', steps_per_s), ',.0f')}/s",
             f"return {_figure(row.get('return_mean', math.nan), '.2f')}",
             f"length {_figure(row.get('episode_length_mean', math.nan), '.0f')}",
+            *([f"lesson {', '.join(lessons)}"] if lessons else []),
             f"{_duration(left_s)} left",
         )
     )

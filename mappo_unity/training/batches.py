@@ -78,9 +78,16 @@ class BatchCollector:
 
         return self._with_records(parts[0] if len(parts) == 1 else torch.cat(parts, 0))
 
+    def restart(self) -> None:
+        """Reset the scene: the next batch begins with new episodes."""
+        self._env.restart()
+        self._collector.reset_at_each_iter = True  # hands out what the reset has brought
+
     def _play(self, rounds: int) -> TensorDictBase:
         self._collector.frames_per_batch = self._collector.requested_frames_per_batch = rounds
-        return next(self._parts)
+        part = next(self._parts)
+        self._collector.reset_at_each_iter = False
+        return part
 
     def _with_records(self, rounds: TensorDictBase) -> Batch:
         env = self._env

@@ -32,6 +32,11 @@ class RecentEpisodes:
         self.total += count
         return count
 
+    def forget(self) -> None:
+        """Empty the window; the total stays."""
+        for rows in self.recent.values():
+            rows.clear()
+
     @property
     def full(self) -> bool:
         """Whether every behavior has as many episodes as the window holds."""

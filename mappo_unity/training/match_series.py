@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from mappo_unity.config.schema import Config
+from mappo_unity.config.schema import Config, EnvConfig
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.actor_critic import UnityActor
@@ -62,7 +62,7 @@ class MatchSeries:
         return last or self._interval_is_over(agent_steps)
 
     def play(
-        self, agent_steps: int, layout: dict[str, Any], actors: dict[str, UnityActor]
+        self, env: EnvConfig, agent_steps: int, layout: dict[str, Any], actors: dict[str, UnityActor]
     ) -> dict[str, float]:
         """Play a series and return its figures; the random numbers of training stay untouched."""
         cfg = self._cfg
@@ -72,7 +72,7 @@ class MatchSeries:
         with torch.random.fork_rng(devices=cuda):
             torch.manual_seed(cfg.seed + agent_steps)
             # a folder of its own: the run's players log under the same names
-            make_env = make_env_function(cfg.env, self._folder / PLAYERS / "matches")
+            make_env = make_env_function(env, self._folder / PLAYERS / "matches")
             seed = (cfg.seed + agent_steps) % 2**31
             scores = play_matches(make_env, policy, RandomPolicy(seed), cfg.matches.count, seed)
 

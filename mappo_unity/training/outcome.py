@@ -47,7 +47,8 @@ def why_over(cfg: Config, path: Path) -> str | None:
     # the window is as long as the options of the resumed run say
     episodes = RecentEpisodes(cfg.log.return_window, list(state["window"]["recent"]))
     episodes.load_state_dict(state["window"])
-    if cfg.stop_at_return is not None and episodes.reached(cfg.stop_at_return):
+    are_last = state.get("lessons", {}).get("are_last", True)
+    if cfg.stop_at_return is not None and are_last and episodes.reached(cfg.stop_at_return):
         mean = episodes.summary()["return_mean"]
         return (
             f"its mean return {mean:.4g} has reached stop_at_return={cfg.stop_at_return:g}; "

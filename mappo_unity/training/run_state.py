@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from mappo_unity.config.parameters.values import params_at
 from mappo_unity.config.per_behavior import behavior_config
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
@@ -16,7 +18,7 @@ from mappo_unity.policies.export import sample_inputs
 from mappo_unity.policies.layouts import guessed_otherwise, without_channels
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
-from mappo_unity.training.batches import Batch
+from mappo_unity.training.batches import Batch, BatchCollector
 from mappo_unity.training.episode_stats import RecentEpisodes
 from mappo_unity.training.match_series import MatchSeries
 from mappo_unity.training.resume_check import (
@@ -55,6 +57,7 @@ class RunState:
         self.restarts_before = self.dropped_episodes = self.dropped_steps = 0
         self.recent_episodes = RecentEpisodes(cfg.log.return_window, list(setup.env.behaviors))
         self.matches = MatchSeries(cfg, folder, setup.env.behaviors)
+        self.lessons = setup.lessons
         self.samples: dict[str, dict[str, torch.Tensor]] = {}
         self._restarts_here = 0
         self._rng_state: dict[str, Any] | None = None  # of the checkpoint that is resumed
@@ -107,14 +110,33 @@ class RunState:
         counters = {"iteration": self.iteration, "agent_steps": self.agent_steps, "wall_s": self.wall_s}
         episodes = {"episodes": self.recent_episodes.total, "episodes_new": episodes_new}
         times = {"steps_per_s": steps / seconds, "collect_s": collect_s, "update_s": update_s}
-        return counters | episodes | self.recent_episodes.summary() | times
+        return counters | episodes | self.recent_episodes.summary() | times | self.lessons.metrics()
+
+    def advance_lessons(self, batch: Batch, batches: BatchCollector) -> list[str]:
+        """Go on to the next lessons where those in force are complete; return a line about each.
+
+        What was said about recent episodes and the best policy does not hold for other lessons.
+        """
+        changes = self.lessons.advance(batch.episodes, self.agent_steps / self.cfg.max_steps)
+        if not changes:
+            return []
+
+        for change in changes:
+            self.setup.env.set_parameter(change.name, change.lesson.value)
+        if any(change.require_reset for change in changes):
+            batches.restart()
+            self.setup.forget_pending()
+        self.recent_episodes.forget()
+        self.best_score = -math.inf
+        return [f"{self.agent_steps:,} steps: {change}" for change in changes]
 
     def play_matches(self) -> dict[str, float]:
         """Play a series of matches where one is due, and return its figures."""
         if not self.matches.is_due(self.agent_steps):
             return {}
         actors = {name: learner.actor for name, learner in self.setup.learners.items()}
-        return self.matches.play(self.agent_steps, self._layout(), actors)
+        env = replace(self.cfg.env, params=params_at(self.cfg.env.params, self.lessons.numbers))
+        return self.matches.play(env, self.agent_steps, self._layout(), actors)
 
     def score(self) -> float:
         """Return what the best checkpoint is chosen by: return_mean; where there are two sides, the matches.
@@ -139,6 +161,7 @@ class RunState:
             "memories": {name: memory.clone() for name, memory in self.setup.policy.memories.items()},
             "window": self.recent_episodes.state_dict(),
             "matches": self.matches.state_dict(),
+            "lessons": self.lessons.state_dict(),
             "rng": get_rng_state(),
             "samples": self.samples,
             **{name: getattr(self, name) for name in _COUNTERS},
@@ -166,6 +189,7 @@ class RunState:
             memories = state.get("memories", {})
             self.setup.policy.memories = {name: m.to(self.cfg.device) for name, m in memories.items()}
             self._restore_env(path, checkpoint.to_arrays(state["env"]))
+        self._restore_lessons(state.get("lessons", {}), is_new=state["env"] is None)
 
         self.recent_episodes.load_state_dict(state["window"])
         self.matches.load_state_dict(state["matches"])
@@ -190,6 +214,18 @@ class RunState:
                 f"checkpoint {path} does not fit the environment's options, which cannot change with resume: "
                 f"{error}"
             ) from error
+
+    def _restore_lessons(self, state: dict[str, Any], is_new: bool) -> None:
+        """Set the parameters whose values the environment has not: it `is_new`, or options were changed."""
+        first = self.lessons.values
+        changed = self.lessons.load_state_dict(state)
+        if is_new:
+            changed = {name: value for name, value in self.lessons.values.items() if value != first[name]}
+
+        for name, value in changed.items():
+            self.setup.env.set_parameter(name, value)
+        if is_new and changed:  # its first episodes began with the first lessons
+            self.setup.env.restart()
 
     def _layout(self) -> dict[str, Any]:
         # networks that guess their channels stay those of a checkpoint that does not tell

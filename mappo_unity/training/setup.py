@@ -20,9 +20,12 @@ from torchrl.envs import EnvBase, ExplorationType
 from mappo_unity.config.per_behavior import behavior_config, check_behaviors
 from mappo_unity.config.schema import CollectConfig, Config, CriticKind, ModelConfig, PPOConfig
 from mappo_unity.envs.backends import make_env_function
+from mappo_unity.envs.replay import make_replay_function, read_fitting
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
+from mappo_unity.learning.imitation.cloning import Cloning
+from mappo_unity.learning.imitation.expert import make_expert
 from mappo_unity.learning.networks.actor_critic import JointPolicy, make_actor, make_critic
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
@@ -34,6 +37,7 @@ from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.scenes.contract.images import looks_unmarked
 from mappo_unity.training.batches import Batch, BatchCollector, count_present
+from mappo_unity.training.lessons.curriculum import lessons_of
 from mappo_unity.training.memory import check_free, show_size
 
 BATCH_COPIES = 6
@@ -51,8 +55,8 @@ class TrainingSetup:
         cfg: the run's options.
         env: the environment, open.
 
-    Attributes: `learners` by policy name; `policy`, their actors as one; `rounds` of a batch; `notes`, lines
-    for the user; `guesses_channels`, whether `guess_channels` built the networks.
+    Attributes: `learners` by policy name; `policy`, their actors as one; `lessons` of environment parameters;
+    `notes`, lines for the user; `guesses_channels`, whether `guess_channels` built the networks.
 
     Raises:
         ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
@@ -61,6 +65,8 @@ class TrainingSetup:
     def __init__(self, cfg: Config, env: UnityEnv) -> None:
         self.cfg, self.env = cfg, env
         self.notes = [f"note: {cfg.env.note}"] if cfg.env.note is not None else []
+        self.lessons = lessons_of(cfg.env, env)
+        self.notes += self.lessons.notes
 
         self.guesses_channels = False
         self._make_learners(self.notes.append)
@@ -101,6 +107,11 @@ class TrainingSetup:
             metrics[name] = learner.learn(batch.of(name), progress)
         torch.set_num_threads(self.cfg.num_threads)
         return metrics
+
+    def forget_pending(self) -> None:
+        """Drop the decisions whose outcome has not arrived: the environment was reset."""
+        for learner in self.learners.values():
+            learner.carried.rounds = None
 
 
 @contextmanager
@@ -145,8 +156,9 @@ def check_device(device: str) -> None:
 
 def make_unity_env(cfg: Config, folder: Path) -> UnityEnv:
     """Open the environment of the options behind the adapter; players log below the run's folder."""
+    make_env = make_replay_function(cfg) if cfg.bc.only else make_env_function(cfg.env, folder / PLAYERS)
     return UnityEnv(
-        make_env_function(cfg.env, folder / PLAYERS),
+        make_env,
         cfg.seed,
         action_limit=CONTINUOUS_LIMIT,
         max_team_size=cfg.env.max_team_size,
@@ -206,7 +218,7 @@ def make_learners(
 
     learners = {}
     for name, sides in env.sides.items():
-        model, ppo, rewards = behavior_config(cfg, name)
+        model, ppo, rewards, bc = behavior_config(cfg, name)
         behavior = env.behaviors[sides[0]]
         # sides that share a policy are stacked: all their teams are rows of its batch
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
@@ -223,11 +235,19 @@ def make_learners(
 
         # Built after the check, so that what does not fit is refused by a line of ours.
         actor = make_actor(obs, layout, team_size, model).to(cfg.device)
-        intrinsic = make_intrinsic(obs, layout, rewards, cfg.device)
+        cloned, judged = (
+            make_expert(read_fitting(demos, behavior.spec, name), obs.keys, cfg.device) if demos else None
+            for demos in (bc.demos, rewards.gail.demos if rewards.gail.strength else [])
+        )
+        intrinsic = make_intrinsic(obs, layout, rewards, cfg.device, judged)
         critic = make_critic(obs, team_size, model, layout, 1 + len(intrinsic)).to(cfg.device)
         shares = model.critic is CriticKind.poca and team_size > 1
         streams = RewardStreams(ppo, rewards, intrinsic, obs.keys, shares)
-        learners[name] = PolicyLearner(actor, critic, ppo, streams)
+        cloning = None
+        if cloned is not None:
+            share = bc.steps / cfg.max_steps if bc.steps else None
+            cloning = Cloning(actor, cloned, bc, ppo, share)
+        learners[name] = PolicyLearner(actor, critic, ppo, streams, cloning)
 
     return learners
 

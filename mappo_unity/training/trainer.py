@@ -18,7 +18,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
 from mappo_unity.runs.logger import RunLog
 from mappo_unity.signals import Interrupted
-from mappo_unity.training.batches import Batch
+from mappo_unity.training.batches import BatchCollector
 from mappo_unity.training.episode_stats import by_policy
 from mappo_unity.training.memory import is_out_of_memory
 from mappo_unity.training.outcome import DIVERGED, FINISHED, INTERRUPTED, SOLVED, Outcome, why_over
@@ -87,7 +87,7 @@ def train(
 
 def _iterate(
     cfg: Config,
-    batches: Iterator[Batch],
+    batches: BatchCollector,
     state: RunState,
     saver: CheckpointSaver,
     log: RunLog,
@@ -107,9 +107,12 @@ def _iterate(
 
         row = state.count(batch, collect_s=collected_s - started_s, update_s=learned_s - collected_s)
         row |= crashed | by_policy(learned)
+        new_lessons = state.advance_lessons(batch, batches)
         saver.complete()  # whatever happens from here on, this iteration is saved
         for name, metrics in learned.items():
             _warn_rollback(name, metrics, state, log)
+        for text in new_lessons:
+            log.message(text)
 
         series: dict[str, float] = {}
         try:
@@ -135,7 +138,8 @@ def _status(cfg: Config, state: RunState, stop: StopSignals) -> str | None:
         return INTERRUPTED
     if state.agent_steps >= cfg.max_steps:
         return FINISHED
-    if cfg.stop_at_return is not None and state.recent_episodes.reached(cfg.stop_at_return):
+    goal = cfg.stop_at_return
+    if goal is not None and state.lessons.are_last and state.recent_episodes.reached(goal):
         return SOLVED
     return None
 

@@ -14,6 +14,7 @@ from mappo_unity.config.schema import PlayConfig
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.policies.first_checks import check_embedded
 from mappo_unity.policies.policy import Policy
+from mappo_unity.policies.policy_files import at_its_lessons
 from mappo_unity.protocol.demos.recording_env import RecordingEnv
 from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes.core.scene import Scene
@@ -96,7 +97,8 @@ def open_scene(cfg: PlayConfig) -> Scene:
     """Open one area of the scene that a run was trained in, or that `cfg.env` names."""
     options = config_to_play(Path(cfg.run or ""), cfg.env).env
     check_embedded(options)
-    return make_scene(options.name, seed=cfg.seed, **{**options.params, "num_areas": 1})
+    options = at_its_lessons(options, cfg.run or cfg.policy or RANDOM)
+    return make_scene(options.name, seed=cfg.seed, **{**options.parameters, "num_areas": 1})
 
 
 def policy_of(cfg: PlayConfig, scene: Scene) -> Policy:

@@ -13,11 +13,10 @@ from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
 from mappo_unity.config.schema import Activation, CuriosityConfig
-from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
+from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
 from mappo_unity.learning.networks.mlp import ACTIVATIONS, make_mlp
-from mappo_unity.learning.networks.poca import flat_actions
-from mappo_unity.learning.rewards.transitions import Transitions
+from mappo_unity.learning.transitions import Transitions, env_actions
 
 MODEL_WIDTH = 256  # of the hidden layer of both models
 FORWARD_WEIGHT, INVERSE_WEIGHT = 2.0, 8.0  # 10 * (0.2 * forward + 0.8 * inverse)
@@ -49,12 +48,12 @@ class Curiosity(nn.Module):
     def rewards(self, decisions: Transitions) -> Tensor:
         """Return half the squared error of the forward model, float32 ``[D]``."""
         before, after = self._features(decisions.obs), self._features(decisions.next_obs)
-        return self._error(before, after, self._actions(decisions))
+        return self._error(before, after, env_actions(decisions.action, self.layout))
 
     def loss(self, decisions: Transitions) -> Tensor:
         """Return the weighted loss of both models, a scalar."""
         before, after = self._features(decisions.obs), self._features(decisions.next_obs)
-        action = self._actions(decisions)
+        action = env_actions(decisions.action, self.layout)
 
         told = self.inverse(torch.cat([before, after], -1))
         parts = list(told.split([self.layout.continuous, *self.layout.branches], -1))
@@ -71,12 +70,3 @@ class Curiosity(nn.Module):
     def _error(self, before: Tensor, after: Tensor, action: Tensor) -> Tensor:
         foreseen = self.foresight(torch.cat([before, action], -1))
         return 0.5 * ((after - foreseen) ** 2).sum(-1)
-
-    def _actions(self, decisions: Transitions) -> Tensor:
-        """Return actions ``[D, C + sum of branches]`` as the environment takes them, branches one-hot."""
-        size = self.layout.continuous
-        flat = flat_actions(decisions.action, self.layout)
-        if not size:
-            return flat
-        clipped = flat[:, :size].clamp(-CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT
-        return torch.cat([clipped, flat[:, size:]], -1)

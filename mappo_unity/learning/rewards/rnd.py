@@ -12,7 +12,7 @@ from mappo_unity.config.schema import Activation, RNDConfig
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
 from mappo_unity.learning.networks.mlp import make_mlp
-from mappo_unity.learning.rewards.transitions import Transitions
+from mappo_unity.learning.transitions import Transitions
 
 
 class RandomNetwork(nn.Module):

@@ -14,13 +14,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from mappo_unity import keys
-from mappo_unity.config.schema import CuriosityConfig, PPOConfig, RewardsConfig, RNDConfig
+from mappo_unity.config.schema import CuriosityConfig, GAILConfig, PPOConfig, RewardsConfig, RNDConfig
 from mappo_unity.learning.decisions import DecisionView
+from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout, RunningNorm
 from mappo_unity.learning.rewards.curiosity import Curiosity
+from mappo_unity.learning.rewards.gail import Discriminator
 from mappo_unity.learning.rewards.rnd import RandomNetwork
-from mappo_unity.learning.rewards.transitions import Transitions, find_transitions
+from mappo_unity.learning.transitions import Transitions, find_transitions
 
 EXTRINSIC = "extrinsic"
 ROWS = 4096  # decisions that are judged at once: images of a whole batch would not fit into memory
@@ -35,7 +37,7 @@ class IntrinsicStream:
         cfg: the stream's options.
     """
 
-    def __init__(self, name: str, model: nn.Module, cfg: CuriosityConfig | RNDConfig) -> None:
+    def __init__(self, name: str, model: nn.Module, cfg: CuriosityConfig | RNDConfig | GAILConfig) -> None:
         self.name, self.cfg = name, cfg
         self.model: Any = model
         learns = [parameter for parameter in model.parameters() if parameter.requires_grad]
@@ -172,11 +174,22 @@ class RewardStreams:
 
 
 def make_intrinsic(
-    obs: ObsLayout, layout: ActionLayout, cfg: RewardsConfig, device: str
+    obs: ObsLayout, layout: ActionLayout, cfg: RewardsConfig, device: str, expert: Expert | None = None
 ) -> list[IntrinsicStream]:
-    """Build the intrinsic streams that are on."""
-    kinds: dict[str, type] = {"curiosity": Curiosity, "rnd": RandomNetwork}
-    return [
-        IntrinsicStream(name, kinds[name](obs, layout, own).to(device), own)
-        for name, own in cfg.intrinsic.items()
-    ]
+    """Build the intrinsic streams that are on.
+
+    Args:
+        obs, layout: what an agent observes and does.
+        cfg: the streams' options.
+        device: of the networks.
+        expert: the demonstrations, where GAIL is on.
+    """
+    models: dict[str, nn.Module] = {}
+    if "curiosity" in cfg.intrinsic:
+        models["curiosity"] = Curiosity(obs, layout, cfg.curiosity)
+    if "rnd" in cfg.intrinsic:
+        models["rnd"] = RandomNetwork(obs, layout, cfg.rnd)
+    if "gail" in cfg.intrinsic:
+        assert expert is not None, "GAIL learns from demonstrations"
+        models["gail"] = Discriminator(obs, layout, cfg.gail, expert)
+    return [IntrinsicStream(name, model.to(device), cfg.intrinsic[name]) for name, model in models.items()]

@@ -63,7 +63,7 @@ class Ball3D(Scene):
     PARAMETERS = {
         "mass": Parameter(1.0, above=0.0),
         "scale": Parameter(1.0, above=0.0),
-        "gravity": Parameter(9.81),
+        "gravity": Parameter(9.81, at_once=True),
     }
 
     def __init__(self, **options: Any) -> None:
@@ -195,11 +195,12 @@ class Ball3D(Scene):
         self.ball_position += np.einsum("ijn,jn->ni", self._matrix, shift)
 
     def _read_parameters(self, slots: np.ndarray) -> None:
-        mass, scale = self.parameters["mass"], self.parameters["scale"]
-        changed = slots[(self.mass[slots] != mass) | (self.scale[slots] != scale)]
-        if changed.size:
-            self.mass[changed], self.scale[changed] = mass, scale
-            self._set_balls(changed)
+        mass, scale = (self.parameters.draw(name, len(slots)) for name in ("mass", "scale"))
+        changed = (self.mass[slots] != mass) | (self.scale[slots] != scale)
+        if changed.any():
+            areas = slots[changed]
+            self.mass[areas], self.scale[areas] = mass[changed], scale[changed]
+            self._set_balls(areas)
 
     def _set_balls(self, areas: np.ndarray) -> None:
         for area in areas.tolist():

@@ -12,17 +12,13 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 from mlagents_envs.exception import UnityEnvironmentException
 
+from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.core.agents import Agents, as_slots
 from mappo_unity.scenes.core.exchange import Exchange
+from mappo_unity.scenes.core.parameters import Parameters
 from mappo_unity.scenes.core.records import Records, steps_from_state, steps_state
-from mappo_unity.scenes.core.specs import (
-    Behavior,
-    Parameter,
-    at_least_one,
-    checked_parameter,
-    checked_seed,
-)
+from mappo_unity.scenes.core.specs import Behavior, Parameter, at_least_one, checked_seed
 from mappo_unity.scenes.core.tick import finish_tick, run_to_exchange
 
 
@@ -50,20 +46,20 @@ class Scene(BaseEnv):
     MAX_STEP: ClassVar[int] = 0
     """Ticks after which an agent's episode is interrupted; 0: never."""
     PARAMETERS: ClassVar[Mapping[str, Parameter]] = {}
-    """Environment parameters that the scene reads."""
+    """Environment parameters that the scene reads, as `self.parameters[name]` or `self.parameters.draw`."""
 
     counter: int
     """Ticks of the academy since the start or the last env.reset()."""
 
     def __init__(
-        self, *, num_areas: int | None = None, num_threads: int = 1, seed: int = 0, **parameters: float
+        self, *, num_areas: int | None = None, num_threads: int = 1, seed: int = 0, **parameters: Value
     ) -> None:
         self.num_areas = at_least_one("num_areas", num_areas or self.DEFAULT_NUM_AREAS, num_areas)
         self.num_threads = at_least_one("num_threads", num_threads, num_threads)
         self.rng = np.random.default_rng(checked_seed(seed))
-        self.parameters = {name: known.default for name, known in self.PARAMETERS.items()}
+        self.parameters = Parameters(self.NAME, self.PARAMETERS, seed)
         for name, value in parameters.items():
-            self.parameters[name] = checked_parameter(self.NAME, self.PARAMETERS, name, value)
+            self.parameters.set(name, value)
 
         self.agents_per_area = len(self.AREA_BEHAVIORS)
         self.num_slots = self.num_areas * self.agents_per_area
@@ -246,9 +242,9 @@ class Scene(BaseEnv):
         """Set the action of one agent in the last decision steps; those never set act with zeros."""
         self.exchange.set_action_for_agent(behavior_name, agent_id, action)
 
-    def set_parameter(self, name: str, value: float) -> None:
+    def set_parameter(self, name: str, value: Value) -> None:
         """Set an environment parameter; the scene's sheet says when it takes effect."""
-        self.parameters[name] = checked_parameter(self.NAME, self.PARAMETERS, name, value)
+        self.parameters.set(name, value)
         self.parameter_changed(name)
 
     # ---- snapshots --------------------------------------------------------------------------------------
@@ -260,7 +256,7 @@ class Scene(BaseEnv):
             "num_areas": self.num_areas,
             "counter": self.counter,
             "rng": self.rng.bit_generator.state,
-            "parameters": dict(self.parameters),
+            "parameters": self.parameters.get_state(),
             "agents": self.agents.get_state(),
             "stacks": self.records.get_state(),
             "asked": self.exchange.asked.copy(),
@@ -278,7 +274,7 @@ class Scene(BaseEnv):
                 raise ConfigError(f"the snapshot has {key}={state.get(key)!r}, this scene {key}={mine!r}")
         self.counter = state["counter"]
         self.rng.bit_generator.state = state["rng"]
-        self.parameters = dict(state["parameters"])
+        self.parameters.set_state(state["parameters"])
         self.agents.set_state(state["agents"])
         self.records.set_state(state["stacks"])
         self.exchange.results = [(steps_from_state(d), steps_from_state(t)) for d, t in state["results"]]

@@ -77,18 +77,28 @@ class Parameter:
     """Value used until another one is set."""
     above: float = -math.inf
     """Values must be greater than this."""
+    at_once: bool = False
+    """Whether the scene applies it at once, rather than reading it when an area is reset."""
+
+
+def known_parameter(scene: str, known: Mapping[str, Parameter], name: str) -> Parameter:
+    """Return a parameter, or raise `ConfigError` naming the parameters that `scene` has."""
+    if name in known:
+        return known[name]
+    raise ConfigError(
+        f"scene {scene} has no parameter {name!r}; choices: {', '.join(sorted(known)) or 'none'} "
+        f"(besides num_areas and num_threads)"
+    )
 
 
 def checked_parameter(scene: str, known: Mapping[str, Parameter], name: str, value: object) -> float:
-    """Return `value` as a float, or raise `ConfigError` naming the parameters that `scene` has."""
-    if name not in known:
-        raise ConfigError(
-            f"scene {scene} has no parameter {name!r}; choices: {', '.join(sorted(known)) or 'none'} "
-            f"(besides num_areas and num_threads)"
-        )
-
+    """Return `value` as a float; raise `ConfigError` unless it is a number that the parameter can have."""
+    known_parameter(scene, known, name)
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(float(value)):
-        raise ConfigError(f"parameter {name}={value!r} of scene {scene} must be a finite number")
+        raise ConfigError(
+            f"parameter {name}={value!r} of scene {scene} must be a finite number (or, in options, a "
+            "sampler {sampler: ...} or a curriculum {lessons: [...]})"
+        )
 
     number = float(value)
     if number <= known[name].above:

@@ -55,7 +55,7 @@ class DungeonEscape(Scene):
     )
     AREA_BEHAVIORS = (0,) * NUM_AGENTS
     AREA_GROUPS = (0,) * NUM_AGENTS
-    PARAMETERS = {"gravity": Parameter(1.5 * 9.81)}
+    PARAMETERS = {"gravity": Parameter(1.5 * 9.81, at_once=True)}
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -77,7 +77,7 @@ class GridFoodCollector(Scene):
         physics.agent_velocity[:, area, agent] = 0
         physics.agent_position[1, area, agent] = AGENT_HEIGHT
         physics.agent_position[::2, area, agent] = self.rng.uniform(-RANGE, RANGE, (2, num))
-        physics.agent_half[area, agent] = 0.5 * self.parameters["agent_scale"]
+        physics.agent_half[area, agent] = 0.5 * self.parameters.draw("agent_scale", num)
 
         self.yaw_degrees[area, agent] = self.rng.integers(0, 360, num)
         self.frozen[area, agent] = False

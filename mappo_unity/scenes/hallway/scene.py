@@ -61,7 +61,7 @@ class Hallway(Scene):
     )
     DECISION_PERIOD = 6
     MAX_STEP = MAX_STEP
-    PARAMETERS = {"gravity": Parameter(2 * 9.81)}
+    PARAMETERS = {"gravity": Parameter(2 * 9.81, at_once=True)}
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

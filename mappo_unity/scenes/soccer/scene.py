@@ -61,7 +61,7 @@ class SoccerScene(Scene):
     """Play soccer on F fields: what both scenes share."""
 
     DEFAULT_NUM_AREAS = 8
-    PARAMETERS = {"ball_touch": Parameter(0.0), "gravity": Parameter(9.81)}
+    PARAMETERS = {"ball_touch": Parameter(0.0), "gravity": Parameter(9.81, at_once=True)}
     ROLES: ClassVar[tuple[Role, ...]]
     """Roles of a field's agents, by ascending id."""
     VIEWS: ClassVar[tuple[View, ...]]
@@ -99,7 +99,7 @@ class SoccerScene(Scene):
         """Read `ball_touch`; the field's own resets are the scene's, not the agent's."""
         if not self.started:
             self._reset_fields(np.arange(self.num_areas))
-        self.touch_reward[slots] = TOUCH_REWARD * self.parameters["ball_touch"]
+        self.touch_reward[slots] = TOUCH_REWARD * self.parameters.draw("ball_touch", len(slots))
 
     def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
         """Return what the agents' rays meet, one array a sensor."""

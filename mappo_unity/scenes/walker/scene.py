@@ -68,7 +68,7 @@ class Walker(Scene):
     BEHAVIORS = (Behavior("Walker?team=0", (Sensor("VectorSensor_size243", (243,)),), continuous=39),)
     TAKE_ACTIONS_BETWEEN_DECISIONS = False
     MAX_STEP = 5000
-    PARAMETERS = {"gravity": Parameter(14.715)}
+    PARAMETERS = {"gravity": Parameter(14.715, at_once=True)}
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

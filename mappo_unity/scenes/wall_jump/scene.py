@@ -19,7 +19,7 @@ from mappo_unity.scenes.wall_jump.sensors import observe_rays
 SMALL, BIG = 0, 1  # behaviors
 CONFIGURATIONS = 5
 BEHAVIOR_OF = np.array([SMALL, SMALL, BIG, BIG, BIG])
-HEIGHT_OF = ("no_wall_height", "small_wall_height", "big_wall_height", "big_wall_height", "big_wall_height")
+HEIGHT_OF = np.array(["no_wall_height", "small_wall_height", *["big_wall_height"] * 3])
 NOTHING_PENDING = -1
 
 RUN_SPEED = 3.0  # m/s of velocity change in a tick
@@ -60,7 +60,7 @@ class WallJump(Scene):
         "no_wall_height": Parameter(0.0),
         "small_wall_height": Parameter(4.0),
         "big_wall_height": Parameter(8.0),
-        "gravity": Parameter(2.75 * 9.81),
+        "gravity": Parameter(2.75 * 9.81, at_once=True),
     }
 
     def __init__(self, **options: Any) -> None:
@@ -91,8 +91,9 @@ class WallJump(Scene):
             return
 
         drawn = self.configuration[slots]
-        heights = np.array([self.parameters[name] for name in HEIGHT_OF])
-        self.bodies.wall_height[slots] = heights[drawn]
+        for name in dict.fromkeys(HEIGHT_OF):
+            areas = slots[HEIGHT_OF[drawn] == name]
+            self.bodies.wall_height[areas] = self.parameters.draw(name, len(areas))
         self.configuration[slots] = NOTHING_PENDING
 
         behavior = BEHAVIOR_OF[drawn]

@@ -1,4 +1,4 @@
-"""Decisions of a batch with what was observed next: all that an intrinsic reward looks at."""
+"""Decisions with what was observed next: all that an intrinsic reward looks at."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from torch import Tensor
 
 from mappo_unity import keys
 from mappo_unity.learning.decisions import DecisionView
+from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
+from mappo_unity.learning.networks.poca import flat_actions
 
 
 @dataclass(frozen=True)
@@ -98,3 +100,17 @@ def find_transitions(
         rounds.get(keys.ACTION).flatten(0, last_dim)[index],
         torch.from_numpy(ended).to(device),
     )
+
+
+def env_actions(action: Tensor, layout: ActionLayout) -> Tensor:
+    """Return actions ``[D, C + sum of branches]`` as the environment takes them, branches one-hot.
+
+    Args:
+        action: ``[D, C + K]``, as a policy draws them.
+        layout: the sizes.
+    """
+    flat, size = flat_actions(action, layout), layout.continuous
+    if not size:
+        return flat
+    clipped = flat[:, :size].clamp(-CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT
+    return torch.cat([clipped, flat[:, size:]], -1)

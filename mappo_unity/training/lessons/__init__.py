@@ -1,0 +1,1 @@
+"""Environment parameters that change while a run learns."""
