@@ -16,7 +16,7 @@ for a policy with several.
 import re
 
 OBS = "observation"  # float32 [..., A, O]: vector sensors, concatenated in the order of the specs
-SENSOR = "obs_{}"  # float32 [..., A, *sensor shape]: sensor i before concatenation
+SENSOR = "obs_{}"  # [..., A, *sensor shape]: sensor i before concatenation; float32, uint8 of a `ByteImage`
 ACTION = "action"  # see models.ActionLayout
 LOG_PROB = "action_log_prob"  # float32 [..., A]
 LOG_PROBS = "action_log_probs"  # float32 [..., A, C + K]: of each component, where ppo.ratio=component
@@ -32,6 +32,11 @@ GROUP_REWARD = "group_reward"  # float32 [..., A, 1]: reward of the agent's team
 DONE = "done"  # bool [..., A, 1]: terminated or truncated
 TERMINATED = "terminated"  # bool [..., A, 1]: a real end
 TRUNCATED = "truncated"  # bool [..., A, 1]: a time limit ("interrupted" in ML-Agents)
+FINAL = "final"  # of what followed a batch: entries [..., A] of the row after the last
+CUT_OFF = (
+    "cut_off"  # team rows [n, A] in which anybody's episode was cut off (or ended): entries as they were
+)
+CUT_OFF_AT = "cut_off_at"  # int64 [n]: which team rows of the batch these are, from its end: -1 is the last
 VALUE = "state_value"  # float32 [..., A, V]: in the critic's (normalised) space
 ADVANTAGE = "advantage"  # float32 [..., A, 1]
 VALUE_TARGET = "value_target"  # float32 [..., A, V]: in the critic's (normalised) space

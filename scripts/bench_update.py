@@ -47,7 +47,7 @@ def measure(cfg: Config, repeats: int) -> None:
     """Compare both updates on a batch of a scene."""
     with tempfile.TemporaryDirectory() as out, set_up(cfg, Path(out)) as setup, setup.collecting() as batches:
         name, learner = next(iter(setup.learners.items()))
-        buffer, _ = learner.prepare(next(batches).of(name))
+        buffer, _ = learner.prepare(*next(batches).of(name))
         assert buffer is not None
         rows = learner.rows.take(buffer[:])
         by_hand = HandWritten(learner, rows)

@@ -1,9 +1,12 @@
-"""Advantages from masks alone, as tests write them down."""
+"""Advantages from masks alone, and batches whose ``next`` is whole, as tests write them down."""
 
 from __future__ import annotations
 
+import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from mappo_unity import keys
 from mappo_unity.learning.advantage import Advantage, estimate, make_view
 
 
@@ -25,3 +28,11 @@ def masked_gae(
     return estimate(
         view, reward_T, value_T, end_value_T, final_value, truncated_T, gamma=gamma, gae_lambda=gae_lambda
     )
+
+
+def whole(batch: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+    """Return a batch ``[T, ..., A]`` whose ``next`` holds everything, and all rows of that as cut off."""
+    following = batch.get("next")
+    rows = following.reshape(-1, following.shape[-1])
+    entries = {keys.FINAL: following[-1], keys.CUT_OFF: rows, keys.CUT_OFF_AT: torch.arange(-len(rows), 0)}
+    return batch, TensorDict(entries, [])

@@ -23,7 +23,7 @@ from mappo_unity.config.schema import (
     Schedule,
     ValueNormKind,
 )
-from mappo_unity.envs.transforms import transformed
+from mappo_unity.envs.following import followed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.learning.minibatches import EvenSampler, minibatch_count
 from mappo_unity.training.batches import BatchCollector
@@ -51,9 +51,9 @@ def options(env: Any, **collect: Any) -> Config:
     )
 
 
-def decisions_learnt(learner: Any, batch: Any) -> int:
+def decisions_learnt(learner: Any, batch: tuple[Any, Any]) -> int:
     """Return how many decisions an update of a batch would learn from."""
-    buffer, _ = learner.prepare(batch)
+    buffer, _ = learner.prepare(*batch)
     if buffer is None:
         return 0
     rows = buffer[:]
@@ -89,15 +89,15 @@ def test_the_reward_of_a_decision_that_was_pending_is_not_lost(tmp_path: Path) -
     with set_up(options(waiting_agent, rounds=3), tmp_path) as setup, setup.collecting() as batches:
         (learner,) = setup.learners.values()
 
-        first = next(batches).of("Fake")
-        learner.prepare(first)
+        first, following = next(batches).of("Fake")
+        learner.prepare(first, following)
         carried = learner.carried.rounds
         assert carried is not None and carried.shape[0] == 1
         assert carried[keys.ACTING].flatten().tolist() == [True, False]
         log_prob = first[keys.LOG_PROB][0, 0, 0]
 
         # its end comes with the last result of the next batch
-        buffer, _ = learner.prepare(next(batches).of("Fake"))
+        buffer, _ = learner.prepare(*next(batches).of("Fake"))
         assert buffer is not None
         rows = buffer[:]
         old = rows[keys.LOG_PROB].flatten() == log_prob
@@ -109,7 +109,7 @@ def test_the_reward_of_a_decision_that_was_pending_is_not_lost(tmp_path: Path) -
 def test_what_is_pending_of_a_crashed_episode_is_forgotten(tmp_path: Path) -> None:
     with set_up(options(waiting_agent, rounds=3), tmp_path) as setup, setup.collecting() as batches:
         (learner,) = setup.learners.values()
-        learner.prepare(next(batches).of("Fake"))
+        learner.prepare(*next(batches).of("Fake"))
         assert learner.carried.void(torch.tensor([[[True]], [[False]]])) == 1
         assert not learner.carried.rounds[keys.ACTING].any()
 
@@ -121,7 +121,7 @@ def test_episodes_travel_in_the_batch(tmp_path: Path) -> None:
     from mappo_unity.learning.networks.actor_critic import JointPolicy
 
     policy = JointPolicy({"Fake": learner.actor})
-    batches = BatchCollector(make_collector(transformed(env), policy), env, cfg.collect)
+    batches = BatchCollector(make_collector(followed(env), policy), env, cfg.collect)
     (episode,) = next(batches).episodes["Fake?team=0"]
     assert episode.individual_return == 5.0 and not env.pop_episodes()["Fake?team=0"]
 
@@ -161,10 +161,10 @@ def test_with_poca_a_pending_decision_earns_what_its_mates_earn(tmp_path: Path) 
     cfg.model.critic = CriticKind.poca
     with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
         (learner,) = setup.learners.values()
-        first = next(batches).of("Fake")
-        learner.prepare(first)
+        first, following = next(batches).of("Fake")
+        learner.prepare(first, following)
         log_prob = first[keys.LOG_PROB][0, 0, 0]
-        buffer, _ = learner.prepare(next(batches).of("Fake"))
+        buffer, _ = learner.prepare(*next(batches).of("Fake"))
         rows = buffer[:]
         old = rows[keys.LOG_PROB] == log_prob
         assert rows[keys.VALUE_TARGET].squeeze(-1)[old].tolist() == pytest.approx([6.0])

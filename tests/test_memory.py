@@ -100,7 +100,7 @@ def test_a_memory_is_zero_at_first_frozen_while_nobody_asks_and_carried_over(
 ) -> None:
     with set_up(options(probe), tmp_path) as setup, setup.collecting() as batches:
         actor: Any = setup.learners["Probe"].actor
-        parts = [next(batches).of("Probe") for _ in range(3)]
+        parts = [next(batches).of("Probe")[0] for _ in range(3)]
         rounds = torch.cat([part.exclude("next") for part in parts], 0)
         done = torch.cat([part["next", "done"] for part in parts], 0)
 
@@ -128,7 +128,7 @@ def test_the_first_minibatch_has_ratio_one_and_its_old_values(
     with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
         learner = setup.learners["Probe"]
         for _ in range(3):
-            buffer, _ = learner.prepare(next(batches).of("Probe"))
+            buffer, _ = learner.prepare(*next(batches).of("Probe"))
             assert buffer is not None
             minibatch = learner.rows.take(buffer[:])
             learner.loss(minibatch)
@@ -152,7 +152,7 @@ def learn(cfg: Config, tmp_path: Path, iterations: int) -> Any:
     with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
         for _ in range(iterations):
             setup.learn(next(batches), 0.0)
-        return next(batches).of("Probe")
+        return next(batches).of("Probe")[0]
 
 
 def share_right(batch: Any) -> float:

@@ -22,6 +22,7 @@ from mappo_unity.protocol import decode, encode, messages
 from mappo_unity.protocol.batch_encoding import varint_columns
 from mappo_unity.protocol.serve import Player, env_function, play, serve
 from mappo_unity.scenes import make_scene
+from mappo_unity.scenes.contract.images import ByteImage
 from mappo_unity.scenes.registry import BUILT_IN
 
 from mlagents_envs.base_env import (  # isort: skip  # mappo_unity lets it import
@@ -39,9 +40,9 @@ MIXED = BehaviorSpec([vector_spec(3, "first"), vector_spec(2, "second")], Action
 PICTURE = BehaviorSpec(
     [
         vector_spec(2),
-        ObservationSpec((4, 5, 3), (DimensionProperty.NONE,) * 3, ObservationType.DEFAULT, "camera"),
-        ObservationSpec((4, 6, 1), (DimensionProperty.NONE,) * 3, ObservationType.DEFAULT, "grey"),
-        ObservationSpec((6, 8, 5), (DimensionProperty.NONE,) * 3, ObservationType.GOAL_SIGNAL, "grid"),
+        ByteImage((4, 5, 3), (DimensionProperty.NONE,) * 3, ObservationType.DEFAULT, "camera"),
+        ByteImage((4, 6, 1), (DimensionProperty.NONE,) * 3, ObservationType.DEFAULT, "grey"),
+        ByteImage((6, 8, 5), (DimensionProperty.NONE,) * 3, ObservationType.GOAL_SIGNAL, "grid"),
     ],
     ActionSpec(1, ()),
 )
@@ -124,13 +125,15 @@ class TestWire:
         infos = theirs.rl_output.agentInfos["B?team=1"].value
         brain = theirs.rl_initialization_output.brain_parameters[0]
         assert behavior_spec_from_proto(brain, infos[0]) == spec
-        assert (
-            decode.behavior_spec(
-                ours.rl_initialization_output.brain_parameters[0],
-                ours.rl_output.agentInfos["B?team=1"].value[0],
-            )
-            == spec
+        found = decode.behavior_spec(
+            ours.rl_initialization_output.brain_parameters[0],
+            ours.rl_output.agentInfos["B?team=1"].value[0],
         )
+        assert found == spec
+        marked = [isinstance(sensor, ByteImage) for sensor in found.observation_specs]
+        assert marked == (
+            [False, True, False, True] if spec is PICTURE else [False, False]
+        )  # grey is averaged
         mine = decode.BehaviorDecoder("B?team=1", spec).decode(ours.rl_output.agentInfos["B?team=1"].value)
         their_decision, their_terminal = steps_from_proto(infos, spec)
         assert_same_steps(mine[0], decision)
@@ -138,7 +141,7 @@ class TestWire:
         assert_same_steps(their_terminal, terminal)
         assert_same_steps(their_decision, decision)
 
-    def test_pictures_travel_as_png_only_where_nothing_is_lost(self) -> None:
+    def test_pictures_of_bytes_travel_as_png(self) -> None:
         steps = random_steps(2, PICTURE, np.random.default_rng(1))
         exact = encode.BehaviorEncoder("B", PICTURE).encode(steps, TerminalSteps.empty(PICTURE))
         assert exact.count(b"\x89PNG") == 2 * (1 + 1 + 2)  # 5 channels take two pictures
@@ -148,6 +151,11 @@ class TestWire:
         ) == 2 * (1 + 2)
         plain = encode.BehaviorEncoder("B", PICTURE, png=False).encode(steps, TerminalSteps.empty(PICTURE))
         assert b"\x89PNG" not in plain
+        unmarked = PICTURE._replace(
+            observation_specs=[ObservationSpec(*s) for s in PICTURE.observation_specs]
+        )
+        floats = encode.BehaviorEncoder("B", unmarked).encode(steps, TerminalSteps.empty(unmarked))
+        assert b"\x89PNG" not in floats
 
     @pytest.mark.parametrize("old", [False, True])
     def test_actions_are_read_alike_by_mlagents_and_by_us(self, old: bool) -> None:

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from masked import whole
 from tensordict import TensorDict
 
 from mappo_unity.config.schema import (
@@ -69,7 +70,7 @@ def make_batch(learner, acting=None):
 
 def prepared(learner, batch):
     """Return all rows that an update would draw from."""
-    return learner.prepare(batch)[0][:]
+    return learner.prepare(*whole(batch))[0][:]
 
 
 @pytest.mark.parametrize("layout", [ActionLayout(2, ()), ActionLayout(0, (3, 2)), ActionLayout(1, (4,))])
@@ -77,13 +78,13 @@ def test_the_first_minibatch_has_ratio_one_and_kl_zero(layout):
     learner = make_learner(layout)
     for _ in range(3):  # after the normalisers have moved, too
         batch = make_batch(learner)
-        buffer, _ = learner.prepare(batch)
+        buffer, _ = learner.prepare(*whole(batch))
         first = next(iter(buffer))
         terms = learner.step(first)
         assert learner.loss.log_ratio.abs().max() < 1e-5
         assert terms["kl"].abs() < 1e-6
         assert terms["clip_fraction"] == 0
-        learner.learn(make_batch(learner), 0.0)
+        learner.learn(*whole(make_batch(learner)), 0.0)
 
 
 def test_rows_in_which_nobody_acted_carry_no_loss():
@@ -105,9 +106,9 @@ def test_rows_in_which_nobody_acted_carry_no_loss():
     other["action"] = torch.where(~acting, 99.0, batch["action"])
     twin = copy.deepcopy(learner)
     torch.manual_seed(1)
-    first = learner.learn(batch, 0.0)
+    first = learner.learn(*whole(batch), 0.0)
     torch.manual_seed(1)
-    second = twin.learn(other, 0.0)
+    second = twin.learn(*whole(other), 0.0)
     assert first["policy_loss"] == second["policy_loss"] and first["value_loss"] == second["value_loss"]
     for one, two in zip(learner.params, twin.params):
         assert torch.equal(one, two)
@@ -119,27 +120,27 @@ def test_an_update_that_turns_nan_is_taken_back_and_counted():
     before = copy.deepcopy(learner._trainable_state())
     batch = make_batch(learner)
     batch["action_log_prob"][3, 2, 1] = math.nan
-    metrics = learner.learn(batch, 0.0)
+    metrics = learner.learn(*whole(batch), 0.0)
     assert metrics["rolled_back"] == 1.0 and metrics["rollbacks"] == 1.0
     after = learner._trainable_state()
     for part in ("actor", "critic"):
         for name in before[part]:
             if "norm." not in name:
                 assert torch.equal(before[part][name], after[part][name]), name
-    assert learner.learn(make_batch(learner), 0.0)["rolled_back"] == 0.0
+    assert learner.learn(*whole(make_batch(learner)), 0.0)["rolled_back"] == 0.0
 
 
 def test_an_update_whose_kl_explodes_is_taken_back():
     learner = make_learner(lr=0.5, epochs=8, max_kl=0.05)
-    metrics = learner.learn(make_batch(learner), 0.0)
+    metrics = learner.learn(*whole(make_batch(learner)), 0.0)
     assert metrics["kl_last"] > 0.05 and metrics["rolled_back"] == 1.0
 
 
 def test_target_kl_stops_the_epochs_early():
     eager = make_learner(lr=3e-2, epochs=10, target_kl=1e-3, max_kl=100.0)
-    assert eager.learn(make_batch(eager), 0.0)["kl_stopped"] == 1.0
+    assert eager.learn(*whole(make_batch(eager)), 0.0)["kl_stopped"] == 1.0
     calm = make_learner(lr=1e-6, epochs=2, target_kl=1e-3)
-    assert calm.learn(make_batch(calm), 0.0)["kl_stopped"] == 0.0
+    assert calm.learn(*whole(make_batch(calm)), 0.0)["kl_stopped"] == 0.0
 
 
 def test_schedules_reach_the_optimizer_and_the_loss():
@@ -151,7 +152,7 @@ def test_schedules_reach_the_optimizer_and_the_loss():
         entropy_coef=0.02,
         entropy_coef_final=0.01,
     )
-    metrics = learner.learn(make_batch(learner), 0.5)
+    metrics = learner.learn(*whole(make_batch(learner)), 0.5)
     assert metrics["lr"] == pytest.approx(5.5e-4)
     assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(5.5e-4)
     assert float(learner.loss.clip_epsilon) == pytest.approx(0.2)
@@ -169,12 +170,12 @@ def test_the_huber_threshold_is_the_one_asked_for():
 
 def test_state_goes_on_to_the_bit():
     one, two = make_learner(), make_learner()
-    one.learn(make_batch(one), 0.0)
+    one.learn(*whole(make_batch(one)), 0.0)
     two.load_state_dict(copy.deepcopy(one.state_dict()))
     batch = make_batch(one)
     for learner in (one, two):
         torch.manual_seed(5)
-        learner.learn(batch.clone(), 0.1)
+        learner.learn(*whole(batch.clone()), 0.1)
     for a, b in zip(one.params, two.params):
         assert torch.equal(a, b)
     assert one.value_norm.statistics() == two.value_norm.statistics()
@@ -200,7 +201,7 @@ def test_popart_moves_the_statistics_and_leaves_the_values(kind, hidden, share):
 
 def test_a_step_leaves_the_deviations_in_their_range():
     learner = make_learner(model={"init_log_std": 2}, lr=0.5, entropy_coef=10.0, max_kl=1e9)
-    learner.learn(make_batch(learner), 0.0)
+    learner.learn(*whole(make_batch(learner)), 0.0)
     log_std = learner.actor[0].module.log_std.detach()
     assert float(log_std.max()) == 2 and learner.rollbacks == 0
 
@@ -226,7 +227,7 @@ def test_the_last_step_is_seen_by_the_guard():
     # one minibatch, one epoch: before its step the KL is 0, after it enormous
     learner = make_learner(lr=1.0, epochs=1, num_minibatches=1, max_kl=0.5)
     before = copy.deepcopy(learner._trainable_state())
-    metrics = learner.learn(make_batch(learner), 0.0)
+    metrics = learner.learn(*whole(make_batch(learner)), 0.0)
     assert metrics["kl"] < 1e-6 and metrics["kl_last"] > 0.5 and metrics["rolled_back"] == 1.0
     for name, value in before["actor"].items():
         if "norm." not in name:
@@ -267,7 +268,7 @@ def test_a_ratio_of_each_component_is_clipped_by_itself():
 
 def test_actor_and_critic_have_rates_and_norms_of_their_own():
     learner = make_learner(lr=1e-3, critic_lr=1e-4, lr_schedule=Schedule.linear, separate_optimizers=True)
-    learner.learn(make_batch(learner), 0.5)
+    learner.learn(*whole(make_batch(learner)), 0.5)
     assert [group["lr"] for group in learner.optimizer.param_groups] == pytest.approx([5e-4, 5e-5])
     free = make_learner(max_grad_norm=None)
-    assert free.learn(make_batch(free), 0.0)["grad_norm"] > 0
+    assert free.learn(*whole(make_batch(free)), 0.0)["grad_norm"] > 0

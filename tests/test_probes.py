@@ -34,7 +34,7 @@ def learn(
     factory="probes:make",
     teams=16,
 ):
-    """Train on a probe; return what was set up and the last batch."""
+    """Train on a probe; return what was set up, the last batch, and what followed it."""
     cfg = Config(
         env=EnvConfig(
             name="custom",
@@ -62,9 +62,8 @@ def learn(
     )
     with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
         for _ in range(iterations):
-            batch = next(batches).of("Probe")
-            setup.learners["Probe"].learn(batch, 0.0)
-        return setup, next(batches).of("Probe")
+            setup.learners["Probe"].learn(*next(batches).of("Probe"), 0.0)
+        return setup, *next(batches).of("Probe")
 
 
 def values(setup, batch):
@@ -82,17 +81,17 @@ def chosen(batch, actions="discrete"):
 
 
 def test_constant_reward(tmp_path):
-    setup, batch = learn("Constant", tmp_path, 30)
+    setup, batch, _ = learn("Constant", tmp_path, 30)
     assert values(setup, batch).mean().item() == pytest.approx(1.0, abs=0.02)
 
 
 def test_reward_that_depends_on_the_observation(tmp_path):
-    setup, batch = learn("ObsReward", tmp_path, 40)
+    setup, batch, _ = learn("ObsReward", tmp_path, 40)
     assert torch.allclose(values(setup, batch), batch["observation"].squeeze(-1), atol=0.06)
 
 
 def test_delayed_reward_is_discounted(tmp_path):
-    setup, batch = learn("Delayed", tmp_path, 80)
+    setup, batch, _ = learn("Delayed", tmp_path, 80)
     early = batch["observation"].squeeze(-1) == 0
     value = values(setup, batch)
     assert value[early].mean().item() == pytest.approx(GAMMA, abs=0.03)
@@ -102,25 +101,25 @@ def test_delayed_reward_is_discounted(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("actions", ["continuous", "discrete", "mixed"])
 def test_action_dependent_reward(tmp_path, actions):
-    _, batch = learn("ActionReward", tmp_path, 70, actions)
+    _, batch, _ = learn("ActionReward", tmp_path, 70, actions)
     assert chosen(batch, actions).mean() > 0.9
 
 
 @pytest.mark.parametrize("actions", ["continuous", "discrete", "mixed"])
 def test_observation_and_action_dependent_reward(tmp_path, actions):
-    _, batch = learn("ObsActionReward", tmp_path, 100, actions)
+    _, batch, _ = learn("ObsActionReward", tmp_path, 100, actions)
     earned = batch["observation"].squeeze(-1) * chosen(batch, actions)
     assert earned.mean() > 0.85
 
 
 def test_joint_branches_learn_too(tmp_path):
-    _, batch = learn("ObsActionReward", tmp_path, 60, model={"flatten_branches": True})
+    _, batch, _ = learn("ObsActionReward", tmp_path, 60, model={"flatten_branches": True})
     assert (batch["observation"].squeeze(-1) * chosen(batch)).mean() > 0.9
 
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_credit_goes_to_the_member_that_earned_it(tmp_path, shared):
-    _, batch = learn("Credit", tmp_path, 60, model={"share_parameters": shared})
+    _, batch, _ = learn("Credit", tmp_path, 60, model={"share_parameters": shared})
     assert chosen(batch)[..., 0].mean() > 0.9
 
 
@@ -129,7 +128,7 @@ def test_credit_goes_to_the_member_that_earned_it(tmp_path, shared):
     [k if k is CriticKind.central else pytest.param(k, marks=pytest.mark.slow) for k in CriticKind],
 )
 def test_only_critics_that_see_the_team_know_what_a_mate_knows(tmp_path, kind):
-    setup, batch = learn("MateKnows", tmp_path, 80, model={"critic": kind})
+    setup, batch, _ = learn("MateKnows", tmp_path, 80, model={"critic": kind})
     sign = batch["observation"][..., 0, 0]
     error = (values(setup, batch)[..., 1] - sign).abs().mean().item()
     if kind is CriticKind.local:
@@ -144,33 +143,33 @@ def test_only_critics_that_see_the_team_know_what_a_mate_knows(tmp_path, kind):
 def test_the_baseline_of_poca_takes_out_what_the_mates_did(tmp_path, kind, low, high):
     # only the first's choice earns: the second's advantage is noise, unless its mate's action is known
     ppo = {"lr": 1e-12, "critic_lr": 1e-2, "normalize_advantages": False}
-    setup, batch = learn("Credit", tmp_path, 30, model={"critic": kind}, ppo=ppo, rounds=16)
-    buffer, _ = setup.learners["Probe"].prepare(batch)
+    setup, *batch = learn("Credit", tmp_path, 30, model={"critic": kind}, ppo=ppo, rounds=16)
+    buffer, _ = setup.learners["Probe"].prepare(*batch)
     assert low <= buffer[:]["advantage"][:, 1].var().item() <= high
 
 
 def test_a_member_that_ends_early_learns_from_what_its_team_earns_later(tmp_path):
-    _, batch = learn("EarlyDeath", tmp_path, 80, ppo={"death_masking": True, "lr": 1e-2}, rounds=12)
+    _, batch, _ = learn("EarlyDeath", tmp_path, 80, ppo={"death_masking": True, "lr": 1e-2}, rounds=12)
     first = batch["acting"][..., 0, 0]
     assert chosen(batch)[..., 0][first].mean() > 0.9
 
 
 @pytest.mark.slow
 def test_without_death_masking_it_learns_nothing(tmp_path):
-    _, batch = learn("EarlyDeath", tmp_path, 80, ppo={"death_masking": False, "lr": 1e-2}, rounds=12)
+    _, batch, _ = learn("EarlyDeath", tmp_path, 80, ppo={"death_masking": False, "lr": 1e-2}, rounds=12)
     first = batch["acting"][..., 0, 0]
     assert chosen(batch)[..., 0][first].mean() < 0.9
 
 
 def test_an_agent_that_is_asked_every_other_round(tmp_path):
-    _, batch = learn("Staggered", tmp_path, 60)
+    _, batch, _ = learn("Staggered", tmp_path, 60)
     acting = batch["acting"].squeeze(-1)
     assert not acting.all()
     assert chosen(batch)[acting].mean() > 0.9
 
 
 def test_an_agent_whose_id_changes(tmp_path):
-    setup, batch = learn("NewIds", tmp_path, 60)
+    setup, batch, _ = learn("NewIds", tmp_path, 60)
     assert (batch["observation"].squeeze(-1) * chosen(batch)).mean() > 0.9
     assert min(setup.env.behaviors["Probe?team=0"].slots.agent_id) > 16
 
@@ -183,7 +182,7 @@ def test_an_agent_whose_id_changes(tmp_path):
     ],
 )
 def test_time_limits_bootstrap_and_real_ends_do_not(tmp_path, probe, expected):
-    setup, batch = learn(probe, tmp_path, 150, rounds=10)
+    setup, batch, _ = learn(probe, tmp_path, 150, rounds=10)
     assert values(setup, batch).mean().item() == pytest.approx(expected, rel=0.06)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from masked import whole
 from tensordict import TensorDict
 
 from mappo_unity import keys
@@ -90,7 +91,8 @@ def test_what_follows_a_decision_is_the_agents_next_one_or_its_end() -> None:
     ended[3, 0] = True
     rounds = TensorDict({"observation": seen, keys.ACTING: asked, keys.ACTION: seen + 100}, [4, 2])
     after = torch.arange(50.0, 58.0).view(4, 2, 1)
-    following = TensorDict({"observation": after}, [4, 2])
+    rounds["next"] = TensorDict({"observation": after}, [4, 2])
+    following = whole(rounds)[1]
     view = make_view(asked, flags([0, 1])[0], ended)
 
     found = find_transitions(rounds, following, view, ["observation"])
@@ -177,7 +179,8 @@ def test_without_a_decision_whose_outcome_is_known_nothing_is_earned_and_learnt(
     entries |= {key: torch.zeros(3, 2, 1) for key in (keys.REWARD, keys.GROUP_REWARD)}
     streams = RewardStreams(PPOConfig(), RewardsConfig(rnd=cfg), [stream], ["observation"])
     rounds = TensorDict(entries, [3, 2])
-    rewards, metrics = streams.rewards(rounds, rounds, make_view(nobody, nobody[0], nobody))
+    rounds["next"] = rounds.clone()
+    rewards, metrics = streams.rewards(*whole(rounds), make_view(nobody, nobody[0], nobody))
     assert rewards.shape == (3, 2, 2) and not rewards.any()
     assert metrics == {} and streams.learn() == {}
 
@@ -213,8 +216,8 @@ def learn(rewards: RewardsConfig, folder: Path, iterations: int) -> float:
     found = 0.0
     with set_up(cfg, folder) as setup, setup.collecting() as batches:
         for _ in range(iterations):
-            batch = next(batches).of("Probe")
-            setup.learners["Probe"].learn(batch, 0.0)
+            batch, following = next(batches).of("Probe")
+            setup.learners["Probe"].learn(batch, following, 0.0)
             found += float(batch["next", keys.REWARD].sum())
             if found:
                 break

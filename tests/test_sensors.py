@@ -275,7 +275,7 @@ def learned(probe, tmp_path, iterations, lr, **model):
     ppo = {"lr": lr, "epochs": 8, "minibatch_size": 128}
     model = {"activation": Activation.silu, **model}
     options = {"factory": "sensor_probes:make", "teams": 128}
-    setup, batch = learn(probe, tmp_path, iterations, model=model, ppo=ppo, rounds=2, **options)
+    _, batch, _ = learn(probe, tmp_path, iterations, model=model, ppo=ppo, rounds=2, **options)
     reward = batch["next", "reward"] + batch["next", "group_reward"]
     return reward.mean().item()
 

@@ -20,6 +20,7 @@ from mlagents_envs.base_env import BehaviorSpec, DecisionSteps, TerminalSteps
 
 from mappo_unity.envs.ends import RoundEnds
 from mappo_unity.envs.group_rewards import GroupRewards
+from mappo_unity.envs.images import as_stored, stored_types
 from mappo_unity.envs.returns import Episode as Episode
 from mappo_unity.envs.returns import Returns
 from mappo_unity.envs.slots import SlotTable
@@ -34,7 +35,7 @@ class BehaviorState:
     spec: BehaviorSpec
     slots: SlotTable
     death_masking: bool = True
-    obs: list[np.ndarray] = field(init=False)  # float32 [N, *shape]: newest observation of a slot
+    obs: list[np.ndarray] = field(init=False)  # [N, *shape], newest of a slot: float32, `ByteImage`s uint8
     end_obs: list[np.ndarray] = field(init=False)  # the same, but the terminal one where an episode ended
     end_present: np.ndarray = field(init=False)  # bool [N]: `present`, as of its end where one ended
     end_departed: np.ndarray = field(init=False)  # likewise
@@ -43,7 +44,8 @@ class BehaviorState:
     def __post_init__(self) -> None:
         count = self.slots.num_teams * self.slots.team_size
         self._shapes = [tuple(o.shape) for o in self.spec.observation_specs]
-        self.obs = [np.zeros((count, *shape), np.float32) for shape in self._shapes]
+        shapes = zip(self._shapes, stored_types(self.spec))
+        self.obs = [np.zeros((count, *shape), kind) for shape, kind in shapes]
         self.mask = np.ones((count, sum(self.spec.action_spec.discrete_branches)), bool)
 
         self.acting = np.zeros(count, bool)
@@ -122,9 +124,9 @@ class BehaviorState:
             if not count:
                 return
             rows = slots[own]
-            observations = [o[own] for o in terminal.obs]
+            observations = self._stored([o[own] for o in terminal.obs])
         else:
-            rows, observations = slots, terminal.obs
+            rows, observations = slots, self._stored(terminal.obs)
 
         interrupted = terminal.interrupted[own]
         self.reward[rows] += terminal.reward[own]
@@ -157,9 +159,10 @@ class BehaviorState:
 
     def _add_decision(self, decision: DecisionSteps) -> None:
         slots = self.slots.assign(decision.agent_id, decision.group_id)
+        observations = self._stored(decision.obs)
         group_rewards = decision.group_reward
         if moved := len(self.slots.movers):
-            self._move(slots, decision)
+            self._move(slots, decision, observations)
             # what movers bring was earned in the teams that they left
             group_rewards = group_rewards.copy()
             group_rewards[self.slots.movers] = 0
@@ -182,7 +185,7 @@ class BehaviorState:
         self.reward[earners] += reward
         self.group_reward[earners] += group_reward
 
-        for own, new in zip(self.obs, decision.obs):
+        for own, new in zip(self.obs, observations):
             own[slots] = new
         if self.mask.shape[1]:
             # ML-Agents marks what is forbidden, we mark what is allowed
@@ -195,7 +198,7 @@ class BehaviorState:
             self.first[slots[self.slots.movers]] = True
         self.order = slots
 
-    def _move(self, slots: np.ndarray, decision: DecisionSteps) -> None:
+    def _move(self, slots: np.ndarray, decision: DecisionSteps, observations: list[np.ndarray]) -> None:
         """Cut off the rows of agents that changed their group; their episodes go on in new slots."""
         movers, left = self.slots.movers, self.slots.left
         group_reward = decision.group_reward[movers]
@@ -204,7 +207,7 @@ class BehaviorState:
         self.returns.move(left, slots[movers])
 
         self.truncated[left] = True
-        self._ends.playing(left, [o[movers] for o in decision.obs])
+        self._ends.playing(left, [o[movers] for o in observations])
         self.present[left] = False
 
         alone = ~self._team_plays_on(left)
@@ -213,6 +216,9 @@ class BehaviorState:
             # nobody else is left to tell the departed what they earned
             self._share_group_reward(left[alone], group_reward[alone], everyone)
             self._end_teams(left[alone], interrupted=everyone)
+
+    def _stored(self, observations: list[np.ndarray]) -> list[np.ndarray]:
+        return as_stored(self.name, self.spec, observations)
 
     def _team_plays_on(self, rows: np.ndarray) -> np.ndarray:
         size = self.slots.team_size
@@ -279,7 +285,7 @@ class BehaviorState:
         state = {"first": state["acting"] & (state["length"] == 1)} | state
         for name in self._ARRAYS:
             setattr(self, name, np.array(state[name], getattr(self, name).dtype))
-        self.obs = [np.array(o, np.float32) for o in state["obs"]]
+        self.obs = [o.copy() for o in self._stored(state["obs"])]  # older snapshots hold all as float32
         self.returns.set_state(state)
         if self.group_rewards is not None:
             self.group_rewards.set_state(state)

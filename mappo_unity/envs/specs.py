@@ -24,7 +24,7 @@ def make_specs(
 
         entries: dict[str, Any] = {
             # arrays hold slots as [N, ...], entries as [G, A, ...]
-            keys.SENSOR.format(i): Unbounded((*shape, *o.shape[1:]))
+            keys.SENSOR.format(i): Unbounded((*shape, *o.shape[1:]), dtype=torch.from_numpy(o).dtype)
             for i, o in enumerate(behavior.obs)
         }
         for key in (keys.ACTING, keys.PRESENT, keys.DEPARTED, keys.FIRST):

@@ -30,7 +30,7 @@ def make_transforms(env: UnityEnv) -> Compose:
 
 
 def transformed(env: UnityEnv) -> TransformedEnv:
-    """Return the environment that policies see."""
+    """Return the environment that policies see, its ``next`` entries whole."""
     return TransformedUnityEnv(env, make_transforms(env), cache_specs=True)
 
 

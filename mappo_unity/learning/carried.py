@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mappo_unity import keys
 from mappo_unity.learning.decisions import DecisionView
+from mappo_unity.learning.networks.encoders import in_type
 
 VALUED = "valued"  # bool [..., A, 1]: the row has a value, see `DecisionView`
 _SUMS = (keys.REWARD, keys.GROUP_REWARD)
@@ -52,7 +53,13 @@ class CarriedRounds:
             own = entries[keys.REWARD]
             entries[keys.REWARD] = own.sum(-2, keepdim=True).expand_as(own)
         rounds = TensorDict(entries, batch.batch_size)
-        return rounds if self.rounds is None else torch.cat([self.rounds, rounds], 0)
+        if self.rounds is None:
+            return rounds
+
+        for key, entry in self.rounds.items():
+            if entry.dtype != rounds.get(key).dtype:  # older checkpoints hold all images as floats
+                self.rounds.set(key, in_type(entry, rounds.get(key).dtype))
+        return torch.cat([self.rounds, rounds], 0)
 
     def keep(self, rounds: TensorDict, view: DecisionView) -> None:
         """Keep the rounds in which decisions are pending, with the rewards that have come since."""

@@ -78,9 +78,11 @@ class MaskedClipPPOLoss(ClipPPOLoss):
             "loss_entropy": -self.entropy_coeff.item() * masked_mean(entropy, mask),
         }
 
-    def compare(self, rows: TensorDictBase) -> None:
-        """Set `log_ratio` and `ratio` to what the policy now makes of these rows, without the rest."""
+    @torch.no_grad()
+    def compare(self, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return `log_ratio` and `ratio` of what the policy now makes of these rows, without the rest."""
         self._ratio(self._distribution(rows), rows, rows.get(ACTOR_LEARNS, None))
+        return self.log_ratio, self.ratio
 
     def _distribution(self, rows: TensorDictBase) -> ActionDistribution:
         obs = [rows.get(key) for key in self._actor.obs_keys]

@@ -93,11 +93,12 @@ class PolicyLearner:
         self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
 
-    def learn(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+    def learn(self, batch: TensorDictBase, following: TensorDictBase, progress: float) -> dict[str, float]:
         """Improve the networks by one batch.
 
         Args:
-            batch: ``[T, ..., A]`` entries of this policy name, as collected.
+            batch: ``[T, ..., A]`` entries of this policy name, as collected; ``next`` holds rewards and ends.
+            following: what was seen after them, see `keys.FINAL`, `keys.CUT_OFF` and `keys.CUT_OFF_AT`.
             progress: share of the run that is over, 0 to 1, for the schedules.
 
         Returns:
@@ -106,7 +107,7 @@ class PolicyLearner:
         settings = self._set_schedules(progress)
         metrics: dict[str, float] = {}
         if self.cloning is None or not self.cloning.cfg.only:
-            buffer, metrics = self.prepare(batch)
+            buffer, metrics = self.prepare(batch, following)
             metrics |= self.update(buffer) if buffer is not None else {}
             metrics |= self.rewards.learn()
         if self.cloning is not None:
@@ -125,14 +126,15 @@ class PolicyLearner:
         return {"lr": lr, "clip_epsilon": clip, "entropy_coef": entropy}
 
     @torch.no_grad()
-    def prepare(self, batch: TensorDictBase) -> tuple[ReplayBuffer | None, dict[str, float]]:
+    def prepare(
+        self, batch: TensorDictBase, following: TensorDictBase
+    ) -> tuple[ReplayBuffer | None, dict[str, float]]:
         """Add advantages and targets; return a buffer of the rows that are learnt, None if there are none."""
-        following = batch.get("next")
         rounds = self.carried.join(batch)
         values = self.reader.read(rounds, following)
 
         ended = rounds.get(keys.TERMINATED) | rounds.get(keys.TRUNCATED)
-        view = make_view(rounds.get(VALUED), has_value(following[-1]), ended)
+        view = make_view(rounds.get(VALUED), has_value(following.get(keys.FINAL)), ended)
         rewards, metrics = self.rewards.rewards(rounds, following, view)
         gae = estimate_streams(
             view,
@@ -208,9 +210,10 @@ class PolicyLearner:
                 break
 
         # each step's KL is that before it: what the last one did is seen only now
-        kl_after = float(self._kl_after(minibatch))
+        kl_after = float(approximate_kl(*self.loss.compare(minibatch), minibatch.get(ACTOR_LEARNS, None)))
         metrics = {name: float(value) / steps for name, value in sums.items()}
-        healthy = all(map(math.isfinite, (*metrics.values(), kl_after))) and self._weights_finite()
+        healthy = all(map(math.isfinite, (*metrics.values(), kl_after)))
+        healthy = healthy and all(bool(torch.isfinite(p).all()) for p in self.params)
 
         self.updates += 1
         rolled_back = not healthy or max(kl_epoch, kl_after) > self.cfg.max_kl
@@ -252,21 +255,12 @@ class PolicyLearner:
             }
 
     @torch.no_grad()
-    def _kl_after(self, minibatch: TensorDictBase) -> Tensor:
-        """Return the approximate KL on the last minibatch, now that its step is taken."""
-        self.loss.compare(minibatch)
-        return approximate_kl(self.loss.log_ratio, self.loss.ratio, minibatch.get(ACTOR_LEARNS, None))
-
-    @torch.no_grad()
     def _update_norms(self, batch: TensorDictBase) -> None:
         """Take the batch's observations into the normalisers, after the update that must not see it."""
         if self.norms:
             rows = batch.get(keys.OBS)[batch.get(keys.ACTING).squeeze(-1)]
             for norm in self.norms:
                 norm.update(rows)
-
-    def _weights_finite(self) -> bool:
-        return all(bool(torch.isfinite(p).all()) for p in self.params)
 
     def _trainable_state(self) -> dict[str, Any]:
         return {

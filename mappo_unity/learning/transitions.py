@@ -61,43 +61,35 @@ def find_transitions(
 
     Args:
         rounds: ``[R, ..., A]``, as `CarriedRounds.join` returns them; N slots a round.
-        following: ``[T, ..., A]``, the batch's ``next``.
+        following: what was seen after them, ends too, see `keys.FINAL` and `keys.CUT_OFF`.
         view: of the rounds.
         obs_keys: the observation entries, in the encoders' order.
     """
     acting = rounds.get(keys.ACTING)
     known = view.known & acting.cpu().numpy().reshape(view.known.shape)
     number, slots = known.shape
+    members = rounds.shape[-1]
 
     at, slot = np.nonzero(known)
-    ended, last = view.ends[at, slot], view.last[at, slot]
-    rows = at * slots + slot
-
-    # behind the rounds and the row after them stand the observations of ends, one for each
-    ends = (last[ended] - (number - len(following))) * slots + slot[ended]
+    rows, ended = at * slots + slot, view.ends[at, slot]
     onward = view.following[at, slot] * slots + slot
-    onward[ended] = (number + 1) * slots + np.arange(len(ends))
+
+    # behind the rounds and the row after them stand the team rows of ends, in the order of time
+    ends = view.last[at, slot][ended] * slots + slot[ended]
+    places = following.get(keys.CUT_OFF_AT).cpu().numpy() + number * slots // members
+    team_row = np.searchsorted(places, ends // members)
+    onward[ended] = (number + 1) * slots + team_row * members + ends % members
+
+    parts = rounds, following.get(keys.FINAL), following.get(keys.CUT_OFF)
+    table = [torch.cat([part.get(key).flatten(0, part.ndim - 1) for part in parts]) for key in obs_keys]
 
     device = acting.device
-    terminal = torch.from_numpy(ends).to(device)
-    last_dim = rounds.batch_dims - 1
-    table = [
-        torch.cat(
-            [
-                rounds.get(key).flatten(0, last_dim),
-                following.get(key)[-1:].flatten(0, last_dim),
-                following.get(key).flatten(0, last_dim)[terminal],
-            ]
-        )
-        for key in obs_keys
-    ]
-
     index = torch.from_numpy(rows).to(device)
     return Transitions(
         table,
         index,
         torch.from_numpy(onward).to(device),
-        rounds.get(keys.ACTION).flatten(0, last_dim)[index],
+        rounds.get(keys.ACTION).flatten(0, rounds.ndim - 1)[index],
         torch.from_numpy(ended).to(device),
     )
 

@@ -49,27 +49,27 @@ class ValueReader:
 
         Args:
             rounds: ``[R, ..., A]``, as `CarriedRounds.join` returns them.
-            following: ``[T, ..., A]``, the batch's ``next``.
+            following: what was seen after them, see `keys.FINAL`, `keys.CUT_OFF` and `keys.CUT_OFF_AT`.
         """
         if isinstance(self.critic, RecurrentCritic):
             return self._read_in_turn(self.critic, rounds, following)
 
-        inputs = [rounds.get(key) for key in self.keys]
+        inputs = self._inputs(rounds)
         value = self._value(inputs)
         end = torch.zeros_like(value)
-        where, at = self._cut_off(rounds, following)
-        if len(where):
-            end.flatten(0, -3)[where] = self._value([self._rows(following, key)[at] for key in self.keys])
+        at, cut_off = following.get(keys.CUT_OFF_AT), following.get(keys.CUT_OFF)
+        if len(at):
+            end.flatten(0, -3)[at] = self._value(self._inputs(cut_off))
 
         baseline = None
         if isinstance(self.critic, PocaCritic):
             baseline = self.norm.denormalize(self.critic.baseline(*inputs, rounds.get(keys.ACTION)))
-        return Values(value, end, self._value([following.get(key)[-1] for key in self.keys]), baseline)
+        return Values(value, end, self._value(self._inputs(following.get(keys.FINAL))), baseline)
 
     @torch.no_grad()
     def values_of(self, entries: TensorDictBase) -> Tensor:
         """Return the values of single observations, by a critic without a memory, in the reward's scale."""
-        return self._value([entries.get(key) for key in self.keys])
+        return self._value(self._inputs(entries))
 
     def keep(self, values: Values, pending: Tensor) -> None:
         """Keep the states for the next batch; slots with a pending decision go back to before it.
@@ -82,11 +82,14 @@ class ValueReader:
             before = torch.where(pending, states, 0.0).sum(0)
             self.states[name] = torch.where(pending.any(0), before, self.states[name])
 
+    def _inputs(self, entries: TensorDictBase) -> list[Tensor]:
+        return [entries.get(key) for key in self.keys]
+
     def _value(self, inputs: list[Tensor]) -> Tensor:
         return self.norm.denormalize(self.critic(*inputs))
 
     def _read_in_turn(self, critic: RecurrentCritic, rounds: TensorDict, following: TensorDictBase) -> Values:
-        inputs = [rounds.get(key) for key in self.keys]
+        inputs = self._inputs(rounds)
         action = rounds.get(keys.ACTION) if critic.has_baseline else None
         first, valued = rounds.get(keys.FIRST), rounds.get(VALUED)
 
@@ -97,14 +100,14 @@ class ValueReader:
 
         value = self.norm.denormalize(critic.values(outputs[VALUE_STATE]))
         end = torch.zeros_like(value)
-        where, at = self._cut_off(rounds, following)
-        if len(where):
+        at, cut_off = following.get(keys.CUT_OFF_AT), following.get(keys.CUT_OFF)
+        if len(at):
             # a terminal observation follows the slot's last decision
-            features = critic.features(VALUE_STATE, [self._rows(following, k)[at] for k in self.keys], None)
-            out, _ = critic.step(features, after[VALUE_STATE].flatten(0, -3)[where])
-            end.flatten(0, -3)[where] = self.norm.denormalize(critic.values(out))
+            features = critic.features(VALUE_STATE, self._inputs(cut_off), None)
+            out, _ = critic.step(features, after[VALUE_STATE].flatten(0, -3)[at])
+            end.flatten(0, -3)[at] = self.norm.denormalize(critic.values(out))
 
-        features = critic.features(VALUE_STATE, [following.get(key)[-1] for key in self.keys], None)
+        features = critic.features(VALUE_STATE, self._inputs(following.get(keys.FINAL)), None)
         final = self.norm.denormalize(critic.values(critic.step(features, after[VALUE_STATE][-1])[0]))
 
         baseline = outputs.get(BASELINE_STATE)
@@ -131,18 +134,6 @@ class ValueReader:
 
         self.states[name] = state
         return torch.stack(outputs), torch.stack(before), torch.stack(after)
-
-    @staticmethod
-    def _cut_off(rounds: TensorDict, following: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return the team rows in which anybody was cut off: counted in all rounds, and in the batch's."""
-        at = following.get(keys.TRUNCATED).flatten(0, -3).any(-2).squeeze(-1).nonzero().squeeze(-1)
-        teams = following.get(keys.TRUNCATED).flatten(0, -3).shape[0] // len(following)
-        return at + (len(rounds) - len(following)) * teams, at
-
-    @staticmethod
-    def _rows(entries: TensorDictBase, key: str) -> Tensor:
-        """Return an entry ``[T, ..., A, *]`` as team rows ``[R, A, *]``."""
-        return entries.get(key).flatten(0, entries.batch_dims - 2)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what resuming needs."""

@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from mappo_unity import keys
 from mappo_unity.config.packages import ExportError
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionDistribution
+from mappo_unity.learning.networks.encoders import in_floats
 from mappo_unity.policies.onnx_policy import fit_image, open_session
 
 TOLERANCE = 1e-5  # of deterministic actions, and of the log-probability of the branch taken
@@ -79,7 +80,7 @@ def _feed(
     session: Any, encoder: Any, sensors: Sequence[Sequence[int]], sample: dict[str, torch.Tensor]
 ) -> dict[str, np.ndarray]:
     """Split an actor's inputs into those of the graph."""
-    arrays = {key: values.numpy() for key, values in sample.items()}
+    arrays = {key: in_floats(values).numpy() for key, values in sample.items()}
     shapes = {i.name: list(i.shape) for i in session.get_inputs()}
     images = iter(encoder.images)
     feed, start = {}, 0

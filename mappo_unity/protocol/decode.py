@@ -18,7 +18,7 @@ from mlagents_envs.base_env import (
 
 from mappo_unity.protocol.batch_encoding import VARINT_BYTES, Layout, float_columns, packed_varints
 from mappo_unity.protocol.messages import API_VERSION, CAPABILITIES, PNG, delimited, map_entry, varint
-from mappo_unity.scenes.contract.images import LAST, channel_dim, mark_channels_last
+from mappo_unity.scenes.contract.images import LAST, ByteImage, channel_dim, mark_channels_last
 
 
 class MalformedMessage(Exception):
@@ -188,7 +188,19 @@ def behavior_spec(brain: Any, info: Any, channels_last: bool = False) -> Behavio
     from mlagents_envs.rpc_utils import behavior_spec_from_proto
 
     spec = behavior_spec_from_proto(brain, info)
+    sensors = [
+        ByteImage(*sensor) if _holds_bytes(sensor.shape, observation) else sensor
+        for sensor, observation in zip(spec.observation_specs, info.observations, strict=True)
+    ]
+    spec = spec._replace(observation_specs=sensors)
     return mark_channels_last(spec) if channels_last else spec
+
+
+def _holds_bytes(shape: Sequence[int], observation: Any) -> bool:
+    """Tell whether a sensor's numbers are always those of a picture: sent as PNG, nothing averaged."""
+    planes = [channel for channel in observation.compressed_channel_mapping if channel >= 0]
+    averaged = len(set(planes)) < len(planes) or 1 in (shape[0], shape[-1])
+    return observation.compression_type == PNG and not averaged
 
 
 def initialization(seed: int, num_areas: int, package_version: str) -> bytes:

@@ -25,6 +25,7 @@ from mappo_unity.protocol.messages import (
     map_entry,
     varint,
 )
+from mappo_unity.scenes.contract.images import ByteImage
 
 
 class BehaviorEncoder:
@@ -33,12 +34,15 @@ class BehaviorEncoder:
     Args:
         name: full name, ``Ball?team=0``.
         spec: the behavior's sensors and actions.
-        png: send sensors that are pictures (`is_picture`) as PNG where that loses nothing.
+        png: send `ByteImage`s that are pictures (`is_picture`) as PNG. Clients take the first message's word
+            for what always comes, so other pictures are never sent as PNG.
     """
 
     def __init__(self, name: str, spec: BehaviorSpec, png: bool = True) -> None:
         self.name, self.spec = name, spec
-        self.pictures = [png and is_picture(sensor) for sensor in spec.observation_specs]
+        self.pictures = [
+            png and is_picture(sensor) and isinstance(sensor, ByteImage) for sensor in spec.observation_specs
+        ]
         self.mask_size = sum(spec.action_spec.discrete_branches)
 
         self._head = _head_layout(self.mask_size)

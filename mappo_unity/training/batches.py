@@ -22,7 +22,8 @@ class Batch:
     """A stretch of play: all that a learner and the run's counters need of it.
 
     Attributes:
-        rounds: ``[T]``, one entry a policy name.
+        rounds: ``[T]``, one entry a policy name; ``next`` holds rewards and ends alone.
+        following: by policy name what was seen after them, as `FollowedEnv.pop_following` returns it.
         episodes: those that finished, for each behavior.
         void: by policy name bool ``[..., A, 1]``, slots whose episode a crash cut off that had begun before
             the batch: what is pending of them teaches nothing.
@@ -31,17 +32,18 @@ class Batch:
     """
 
     rounds: TensorDictBase
+    following: dict[str, TensorDictBase]
     episodes: dict[str, list[Episode]]
     void: dict[str, Tensor] = field(default_factory=dict)
     restarts: int | None = None
     dropped_episodes: int = 0
     dropped_steps: int = 0
 
-    def of(self, name: str) -> TensorDictBase:
-        """Return one policy name's entries ``[T, ..., A]``, with its own ``next``."""
+    def of(self, name: str) -> tuple[TensorDictBase, TensorDictBase]:
+        """Return one policy name's entries ``[T, ..., A]`` with its own ``next``, and what followed them."""
         entries = self.rounds.get(name).copy()
         entries.set("next", self.rounds.get(("next", name)))
-        return entries
+        return entries, self.following[name]
 
     def count_decisions(self, name: str) -> int:
         """Return how many agent decisions a policy made in it (ML-Agents' steps)."""
@@ -52,14 +54,13 @@ class BatchCollector:
     """Collect batches from where the environment stands.
 
     Args:
-        collector: plays rounds.
+        collector: plays rounds of a `FollowedEnv`.
         env: what is played, below the collector's transforms.
         cfg: how large a batch is.
     """
 
     def __init__(self, collector: Collector, env: UnityEnv, cfg: CollectConfig) -> None:
         self._collector, self._env, self._cfg = collector, env, cfg
-        self._parts = iter(collector)
 
     def __iter__(self) -> Iterator[Batch]:
         return self
@@ -85,13 +86,18 @@ class BatchCollector:
 
     def _play(self, rounds: int) -> TensorDictBase:
         self._collector.frames_per_batch = self._collector.requested_frames_per_batch = rounds
-        part = next(self._parts)
+        # not through its iterator, which would hold this batch while it collects the next
+        part = self._collector.rollout()
         self._collector.reset_at_each_iter = False
         return part
 
     def _with_records(self, rounds: TensorDictBase) -> Batch:
         env = self._env
-        batch = Batch(rounds, env.pop_episodes(), restarts=env.restarts)
+        following = self._collector.env.pop_following()
+        # only tensors know the device: a collector on the CPU clears that of its batches
+        device = rounds.get((next(iter(env.sides)), keys.ACTING)).device
+        following = {name: part.to(device) for name, part in following.items()}
+        batch = Batch(rounds, following, env.pop_episodes(), restarts=env.restarts)
         if env.restarts is None:
             return batch
 

@@ -1,11 +1,25 @@
-"""How much memory is free, and whether something fits into it."""
+"""How much memory is free, and whether a batch and the networks fit into it."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
+import torch
+
+from mappo_unity.config.schema import Config, ModelConfig
+from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
+from mappo_unity.learning.networks.actor_critic import make_actor, make_critic
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
+
+BATCH_COPIES = 4
+"""Memory of a batch in units of its observations: as collected, behind the rounds that are carried, the rows
+that are learnt, and what the networks make of them."""
+WEIGHT_COPIES = 10
+"""Memory of learning in units of the weights: gradients, two moments of Adam, and two copies of weights and
+moments, to roll an update back and to save the last complete iteration."""
 
 _CGROUP = Path("/sys/fs/cgroup")
 _UNITS = ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
@@ -28,6 +42,37 @@ def check_free(needed: float, what: str, remedy: str) -> None:
     free = free_memory()
     if free is not None and needed > free:
         raise ConfigError(f"{what} takes about {show_size(needed)}, but {show_size(free)} are free; {remedy}")
+
+
+def check_batch_memory(cfg: Config, env: UnityEnv, rounds: int) -> None:
+    """Raise ConfigError if a batch does not fit into the memory that is free."""
+    option = "batch_size" if cfg.collect.rounds is None else "rounds"
+    value = getattr(cfg.collect, option)
+    root = env.root()
+    one_round = root.bytes()
+    # the critic reads all images at once, and as floats
+    as_floats = sum(4 * entry.nbytes for entry in root.values(True, True) if entry.dtype == torch.uint8)
+    check_free(
+        (BATCH_COPIES * one_round + as_floats) * rounds,
+        f"collect.{option}={value}: learning from a batch of {rounds:,} rounds of {show_size(one_round)}",
+        f"lower collect.{option}, or env.num_areas where the environment has it",
+    )
+
+
+def check_network_memory(
+    name: str, obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig
+) -> None:
+    """Raise ConfigError if a policy's networks do not fit into the memory that is free."""
+    with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers
+        nets = make_actor(obs, layout, team_size, cfg), make_critic(obs, team_size, cfg, layout)
+
+    size = sum(p.numel() * p.element_size() for net in nets for p in net.parameters())
+    check_free(
+        WEIGHT_COPIES * size,
+        f"model.hidden={list(cfg.hidden)}, critic {list(cfg.critic_hidden or cfg.hidden)}: learning the "
+        f"networks of {name} ({show_size(size)})",
+        "lower model.hidden or model.critic_hidden",
+    )
 
 
 def show_size(size: float) -> str:

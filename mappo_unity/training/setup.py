@@ -13,19 +13,19 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from mlagents_envs.base_env import ObservationSpec
+from mlagents_envs.base_env import BehaviorSpec, ObservationSpec
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType
 
 from mappo_unity.config.per_behavior import behavior_config, check_behaviors
-from mappo_unity.config.schema import CollectConfig, Config, CriticKind, ModelConfig, PPOConfig
+from mappo_unity.config.schema import CollectConfig, Config, CriticKind, PPOConfig
 from mappo_unity.envs.backends import make_env_function
+from mappo_unity.envs.following import followed
 from mappo_unity.envs.replay import make_replay_function, read_fitting
-from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.imitation.cloning import Cloning
-from mappo_unity.learning.imitation.expert import make_expert
+from mappo_unity.learning.imitation.expert import Expert, make_expert
 from mappo_unity.learning.networks.actor_critic import JointPolicy, make_actor, make_critic
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
@@ -38,14 +38,7 @@ from mappo_unity.runs.rng import seed_everything
 from mappo_unity.scenes.contract.images import looks_unmarked
 from mappo_unity.training.batches import Batch, BatchCollector, count_present
 from mappo_unity.training.lessons.curriculum import lessons_of
-from mappo_unity.training.memory import check_free, show_size
-
-BATCH_COPIES = 6
-"""Memory of a batch in units of its observations: as they were and as next ones, as rounds and as a stack of
-them, and the rows that are learnt with what the networks make of them."""
-WEIGHT_COPIES = 10
-"""Memory of learning in units of the weights: gradients, two moments of Adam, and two copies of weights and
-moments, to roll an update back and to save the last complete iteration."""
+from mappo_unity.training.memory import check_batch_memory, check_network_memory
 
 
 class TrainingSetup:
@@ -84,7 +77,9 @@ class TrainingSetup:
     @contextmanager
     def collecting(self) -> Iterator[BatchCollector]:
         """Yield endless batches, collected from where the environment stands."""
-        collector = make_collector(transformed(self.env), self.policy, device=self.cfg.device)
+        keeps_ends = any(learner.rewards.intrinsic for learner in self.learners.values())
+        env = followed(self.env, keeps_ends)
+        collector = make_collector(env, self.policy, device=self.cfg.device)
         try:
             yield BatchCollector(collector, self.env, self.cfg.collect)
         finally:
@@ -104,7 +99,7 @@ class TrainingSetup:
         for name, learner in self.learners.items():
             if name in batch.void:
                 learner.carried.void(batch.void[name])
-            metrics[name] = learner.learn(batch.of(name), progress)
+            metrics[name] = learner.learn(*batch.of(name), progress)
         torch.set_num_threads(self.cfg.num_threads)
         return metrics
 
@@ -218,7 +213,7 @@ def make_learners(
 
     learners = {}
     for name, sides in env.sides.items():
-        model, ppo, rewards, bc = behavior_config(cfg, name)
+        model, ppo, *_ = behavior_config(cfg, name)
         behavior = env.behaviors[sides[0]]
         # sides that share a policy are stacked: all their teams are rows of its batch
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
@@ -234,22 +229,30 @@ def make_learners(
         check_network_memory(name, obs, layout, team_size, model)
 
         # Built after the check, so that what does not fit is refused by a line of ours.
-        actor = make_actor(obs, layout, team_size, model).to(cfg.device)
-        cloned, judged = (
-            make_expert(read_fitting(demos, behavior.spec, name), obs.keys, cfg.device) if demos else None
-            for demos in (bc.demos, rewards.gail.demos if rewards.gail.strength else [])
-        )
-        intrinsic = make_intrinsic(obs, layout, rewards, cfg.device, judged)
-        critic = make_critic(obs, team_size, model, layout, 1 + len(intrinsic)).to(cfg.device)
-        shares = model.critic is CriticKind.poca and team_size > 1
-        streams = RewardStreams(ppo, rewards, intrinsic, obs.keys, shares)
-        cloning = None
-        if cloned is not None:
-            share = bc.steps / cfg.max_steps if bc.steps else None
-            cloning = Cloning(actor, cloned, bc, ppo, share)
-        learners[name] = PolicyLearner(actor, critic, ppo, streams, cloning)
+        learners[name] = _make_learner(cfg, name, obs, layout, team_size, behavior.spec)
 
     return learners
+
+
+def _make_learner(
+    cfg: Config, name: str, obs: ObsLayout, layout: ActionLayout, team_size: int, spec: BehaviorSpec
+) -> PolicyLearner:
+    model, ppo, rewards, bc = behavior_config(cfg, name)
+    actor = make_actor(obs, layout, team_size, model).to(cfg.device)
+
+    def expert(demos: list[str]) -> Expert:
+        return make_expert(read_fitting(demos, spec, name), obs.keys, cfg.device)
+
+    # a value for each stream of rewards
+    judged = expert(rewards.gail.demos) if rewards.gail.strength else None
+    intrinsic = make_intrinsic(obs, layout, rewards, cfg.device, judged)
+    critic = make_critic(obs, team_size, model, layout, 1 + len(intrinsic)).to(cfg.device)
+    shares = model.critic is CriticKind.poca and team_size > 1
+    streams = RewardStreams(ppo, rewards, intrinsic, obs.keys, shares)
+
+    share = bc.steps / cfg.max_steps if bc.steps else None
+    cloning = Cloning(actor, expert(bc.demos), bc, ppo, share) if bc.demos else None
+    return PolicyLearner(actor, critic, ppo, streams, cloning)
 
 
 def note_unmarked(name: str, sensors: Sequence[ObservationSpec], note: Callable[[str], None]) -> None:
@@ -280,31 +283,3 @@ def check_minibatches(
             f"note: ppo.minibatch_size={ppo.minibatch_size} is larger than the batch of {name}: {rounds} "
             f"rounds x {agents} agents = {rows * team_size} decisions, learnt as one minibatch"
         )
-
-
-def check_batch_memory(cfg: Config, env: UnityEnv, rounds: int) -> None:
-    """Raise ConfigError if a batch does not fit into the memory that is free."""
-    option = "batch_size" if cfg.collect.rounds is None else "rounds"
-    value = getattr(cfg.collect, option)
-    one_round = env.root().bytes()
-    check_free(
-        BATCH_COPIES * one_round * rounds,
-        f"collect.{option}={value}: learning from a batch of {rounds:,} rounds of {show_size(one_round)}",
-        f"lower collect.{option}, or env.num_areas where the environment has it",
-    )
-
-
-def check_network_memory(
-    name: str, obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig
-) -> None:
-    """Raise ConfigError if a policy's networks do not fit into the memory that is free."""
-    with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers
-        nets = make_actor(obs, layout, team_size, cfg), make_critic(obs, team_size, cfg, layout)
-
-    size = sum(p.numel() * p.element_size() for net in nets for p in net.parameters())
-    check_free(
-        WEIGHT_COPIES * size,
-        f"model.hidden={list(cfg.hidden)}, critic {list(cfg.critic_hidden or cfg.hidden)}: learning the "
-        f"networks of {name} ({show_size(size)})",
-        "lower model.hidden or model.critic_hidden",
-    )

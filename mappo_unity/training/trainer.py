@@ -108,6 +108,7 @@ def _iterate(
         row = state.count(batch, collect_s=collected_s - started_s, update_s=learned_s - collected_s)
         row |= crashed | by_policy(learned)
         new_lessons = state.advance_lessons(batch, batches)
+        del batch  # the next one is collected without it
         saver.complete()  # whatever happens from here on, this iteration is saved
         for name, metrics in learned.items():
             _warn_rollback(name, metrics, state, log)

@@ -205,11 +205,24 @@ class Encoder(nn.Module):
         first = int(self.has_vector)
         behind = first + len(self.images)
         parts = [self.norm(obs[0])] if self.has_vector else []
-        parts += [net(image) for net, image in zip(self.images, obs[first:behind])]
+        parts += [net(in_floats(image)) for net, image in zip(self.images, obs[first:behind])]
         if self.sets is not None:
             around = torch.cat(parts, -1) if parts else None
             parts.append(self.sets(around, obs[behind:]))
         return torch.cat(parts, -1)
+
+
+def in_floats(image: Tensor) -> Tensor:
+    """Return an image's float32 numbers, of bytes ``k / 255``; other tensors as they are."""
+    if image.dtype != torch.uint8:
+        return image
+    # by a tensor: on a GPU a division by a number is a multiplication, whose last bit may differ
+    return image.float().div_(torch.full((), 255.0, device=image.device))
+
+
+def in_type(image: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return an image's numbers as bytes (uint8), or in floats."""
+    return in_floats(image) if dtype != torch.uint8 else (image * 255).round().to(dtype)
 
 
 def _goal_columns(layout: ObsLayout, images: list[tuple[str, int]]) -> list[int]:

@@ -138,7 +138,7 @@ class RewardStreams:
 
         Args:
             rounds: ``[R, ..., A]``, as `CarriedRounds.join` returns them.
-            following: ``[T, ..., A]``, the batch's ``next``.
+            following: what was seen after them, see `find_transitions`.
             view: of the rounds.
         """
         own, group = (weight * rounds.get(key) for key, weight in self._weights)

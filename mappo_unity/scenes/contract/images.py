@@ -1,8 +1,12 @@
-"""Where the channels of an image or grid stand: ``C, H, W`` or ``H, W, C``.
+"""What an image or grid says of itself: where its channels stand, and whether bytes hold it.
 
-ML-Agents marks height and width in a sensor's `dimension_property` (TRANSLATIONAL_EQUIVARIANCE); what is left
-are the channels. Sensors that mark nothing have their channels first, as in Unity's packages from 3.0 on;
-what older packages send is marked where it arrives (`protocol.decode`).
+``C, H, W`` or ``H, W, C``: ML-Agents marks height and width in a sensor's `dimension_property`
+(TRANSLATIONAL_EQUIVARIANCE); what is left are the channels. Sensors that mark nothing have their channels
+first, as in Unity's packages from 3.0 on; what older packages send is marked where it arrives
+(`protocol.decode`).
+
+Pictures that arrive as PNG, and grids of 0 and 1, hold multiples of 1 / 255 alone. A sensor whose spec is a
+`ByteImage` is stored as bytes; networks and files read the floats that they stand for.
 """
 
 from __future__ import annotations
@@ -10,12 +14,41 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import numpy as np
 from mlagents_envs.base_env import BehaviorSpec, DimensionProperty, ObservationSpec
 
 FIRST, LAST = 0, 2
 """The dimension of the channels."""
 
 _FLAT = DimensionProperty.TRANSLATIONAL_EQUIVARIANCE
+
+
+class ByteImage(ObservationSpec):
+    """The spec of an image or grid whose numbers are all ``k / 255`` in float32, k a whole number to 255."""
+
+    __slots__ = ()
+
+
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """Return the uint8 ``k`` of numbers ``k / 255``, images ``[n, ...]``.
+
+    Raises:
+        ValueError: a number is none of these.
+    """
+    out = np.empty(image.shape, np.uint8)
+
+    # row by row: what is worked on stays in the processor's cache
+    with np.errstate(invalid="ignore"):
+        for levels, row in zip(out, image):
+            levels[...] = np.rint(row * np.float32(255))
+            if not np.array_equal(from_bytes(levels), row):
+                raise ValueError("its numbers are not all multiples of 1 / 255 from 0 to 1")
+    return out
+
+
+def from_bytes(image: np.ndarray) -> np.ndarray:
+    """Return the float32 numbers that bytes stand for."""
+    return np.divide(image, np.float32(255), dtype=np.float32)
 
 
 def channel_dim(sensor: ObservationSpec) -> int | None:

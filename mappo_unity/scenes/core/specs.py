@@ -20,6 +20,7 @@ from mlagents_envs.base_env import (
 )
 
 from mappo_unity.errors import ConfigError
+from mappo_unity.scenes.contract.images import ByteImage
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,16 @@ class Sensor:
     """One flag a dimension; None: NONE for every dimension. Rows of varying number: (VARIABLE_SIZE, NONE)."""
     observation_type: ObservationType = ObservationType.DEFAULT
     """What is observed, or a goal signal."""
+    in_bytes: bool = False
+    """Whether every number is k / 255 for a byte k, as in a picture or a grid of 0 and 1: see `ByteImage`."""
 
     def spec(self) -> ObservationSpec:
         """Return the sensor as ML-Agents shows it, stacking included."""
         shape = (self.shape[0] * self.stack, *self.shape[1:])
         flags = self.dimension_property or (DimensionProperty.NONE,) * len(shape)
         name = self.name if self.stack == 1 else f"StackingSensor_size{self.stack}_{self.name}"
-        return ObservationSpec(shape, flags, self.observation_type, name)
+        kind = ByteImage if self.in_bytes else ObservationSpec
+        return kind(shape, flags, self.observation_type, name)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,9 @@ SHOT_DRIVE, SHOT_KEPT = 0.5, 0.75  # shares of drive and of speed left while sho
 BRAKE_ABOVE, BRAKE_KEPT = 5.0, 0.95  # m/s; share of speed left in a tick
 FROZEN_TICKS = 201  # the first tick more than 4 s later (the step is a little less than 0.02 s)
 FLAT = (DimensionProperty.NONE, *[DimensionProperty.TRANSLATIONAL_EQUIVARIANCE] * 2)
-GRID = Sensor("GridSensor-OneHot", (5, grid_sensor.CELLS, grid_sensor.CELLS), dimension_property=FLAT)
+GRID = Sensor(
+    "GridSensor-OneHot", (5, grid_sensor.CELLS, grid_sensor.CELLS), dimension_property=FLAT, in_bytes=True
+)
 
 
 class GridFoodCollector(Scene):
