@@ -16,12 +16,12 @@ from mappo_unity.learning.networks.encoders import ObsLayout, RunningNorm
 from mappo_unity.policies.onnx_graph import build_model
 
 
-def make(sensors, continuous=0, branches=(), joint=False, team_size=1, head_scale=200, **model):
+def make(sensors, continuous=0, branches=(), joint=False, team_size=1, head_scale=200, goals=None, **model):
     """Return an actor whose outputs differ from row to row, its normaliser moved."""
     torch.manual_seed(0)
     layout = ActionLayout(continuous, tuple(branches), joint)
     cfg = ModelConfig(**{"hidden": [32, 32], "init_log_std": -0.5} | model)
-    actor = make_actor(ObsLayout.from_shapes(sensors), layout, team_size, cfg)
+    actor = make_actor(ObsLayout.from_shapes(sensors, goals=goals), layout, team_size, cfg)
     net = actor[0].module
     with torch.no_grad():
         if team_size == 1:
@@ -36,7 +36,11 @@ def make(sensors, continuous=0, branches=(), joint=False, team_size=1, head_scal
 def inputs(sensors, branches=(), rows=40):
     """Return random inputs of an actor; every branch keeps an allowed action."""
     torch.manual_seed(1)
-    sample = {f"obs_{i}": torch.rand(rows, *s) for i, s in enumerate(sensors) if len(s) == 3}
+    sample = {f"obs_{i}": torch.rand(rows, *s) for i, s in enumerate(sensors) if len(s) != 1}
+    for i, shape in enumerate(sensors):
+        if len(shape) == 2:
+            # from none to all of the entities are there
+            sample[f"obs_{i}"][torch.rand(rows, shape[0]) < torch.rand(rows, 1) * 2 - 0.5] = 0.0
     vectors = sum(s[0] for s in sensors if len(s) == 1)
     if vectors:
         sample["observation"] = torch.randn(rows, vectors) * 3 + 1

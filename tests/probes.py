@@ -17,6 +17,7 @@ from mlagents_envs.base_env import (
     BaseEnv,
     BehaviorSpec,
     DecisionSteps,
+    ObservationSpec,
     TerminalSteps,
 )
 
@@ -37,7 +38,7 @@ class Probe(BaseEnv):
     def __init__(self, seed: int, teams: int = 16, actions: str = "discrete") -> None:
         self.rng = np.random.default_rng(seed)
         self.teams, self.actions = teams, actions
-        self.spec = BehaviorSpec([vector_spec(self.obs_size)], ACTIONS[actions])
+        self.spec = BehaviorSpec(self.sensor_specs(), ACTIONS[actions])
         self.count = teams * self.members
         self.ids = np.arange(self.count)
         self.clock = np.zeros(teams, int)  # decisions since the team's episode began
@@ -52,6 +53,14 @@ class Probe(BaseEnv):
     def observe(self) -> np.ndarray:
         """Return observations [G, A, O]."""
         return np.zeros((self.teams, self.members, self.obs_size))
+
+    def sensor_specs(self) -> list[ObservationSpec]:
+        """Return the specs of the sensors: one vector, unless the probe has others."""
+        return [vector_spec(self.obs_size)]
+
+    def sensors(self) -> list[np.ndarray]:
+        """Return what each sensor shows, float [G * A, ...]."""
+        return [self.observe().reshape(self.count, -1)]
 
     def earn(self, choice: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return individual rewards [G, A] and group rewards [G] for choices [G, A] in [-1, 1]."""
@@ -131,7 +140,7 @@ class Probe(BaseEnv):
         n = self.spec.action_spec.discrete_branches
         mask = [np.zeros((len(rows), size), bool) for size in n] if n else None
         out = DecisionSteps(
-            [self.observe().reshape(self.count, -1)[rows].astype(np.float32)],
+            [values[rows].astype(np.float32) for values in self.sensors()],
             self.reward.reshape(-1)[rows].astype(np.float32),
             self.ids[rows].astype(np.int32),
             mask,
@@ -145,7 +154,7 @@ class Probe(BaseEnv):
     def _terminals(self, over: np.ndarray, cut: np.ndarray) -> TerminalSteps:
         rows = np.flatnonzero(np.repeat(over, self.members))
         return TerminalSteps(
-            [self.observe().reshape(self.count, -1)[rows].astype(np.float32)],
+            [values[rows].astype(np.float32) for values in self.sensors()],
             self.reward.reshape(-1)[rows].astype(np.float32),
             np.repeat(cut, self.members)[rows],
             self.ids[rows].astype(np.int32),

@@ -31,6 +31,7 @@ from mappo_unity.training.setup import check_device
 SMALL = ["collect.rounds=12", "ppo.minibatch_size=32", "ppo.epochs=2", "log.loggers=[]", "log.progress=false"]
 COMMON = [*SMALL, "export_onnx=false", "seed=7", "checkpoint_interval=1", "model.hidden=[16]"]
 BALL = ["env=3DBall", "env.num_areas=4"]
+SENSES = ["env=custom", "env.factory=sensor_probes:make", "env.params.actions=continuous"]
 BY_PART = ["ppo.ratio=component", "ppo.value_norm_update=minibatch", "ppo.normalize_values=running"]
 ROOM = ["env=DungeonEscape", "env.num_areas=1"]
 RUNS = {
@@ -42,6 +43,14 @@ RUNS = {
     "Hallway": (["env=Hallway", "env.num_areas=2", "ppo.sequence_length=4"], 48),
     "DungeonEscape": (ROOM, 72),
     "remembering": ([*ROOM, "model.memory=gru", "ppo.sequence_length=4"], 72),
+    "sensors": (
+        [*SENSES, "model.goal_conditioning=hyper", "rewards.curiosity.strength=0.1", "collect.rounds=2"],
+        128,
+    ),
+    "sensors, resnet": (
+        [*SENSES, "model.critic=poca", "model.image_encoder=resnet", "collect.rounds=2"],
+        128,
+    ),
     "GridFoodCollector": (["env=GridFoodCollector", "env.num_areas=1", "collect.rounds=6"], 60),
 }
 """Options of each run, besides `COMMON`, and the agent decisions of two iterations."""

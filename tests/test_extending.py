@@ -125,59 +125,62 @@ def test_a_number_that_is_none_is_refused(key: str) -> None:
 
 # ---- an encoder --------------------------------------------------------------------------------------
 
-ROWS = (3, 2)
+VOXELS = (3, 1, 1, 2)
 
 
-class RowsEncoder(nn.Module):
-    """Rows ``[..., N, F]`` through one linear layer; of each feature the largest counts."""
+class VoxelEncoder(nn.Module):
+    """Voxels ``[..., D, H, W, F]`` through one linear layer; of each feature the largest counts."""
 
-    def __init__(self, shape: tuple[int, ...], channel_dim: int) -> None:
+    size = 7
+
+    def __init__(self, shape: tuple[int, ...], *args: object) -> None:
         super().__init__()
-        self.out = nn.Linear(shape[1], encoders.IMAGE_FEATURES)
+        self.out = nn.Linear(shape[3], self.size)
 
-    def forward(self, rows: Tensor) -> Tensor:
-        return self.out(rows).amax(-2)
+    def forward(self, voxels: Tensor) -> Tensor:
+        return self.out(voxels).flatten(-4, -2).amax(-2)
 
 
-def rows_env(seed: int) -> Any:
-    """Return the example, its agents with a second sensor: the way to the target in three rows."""
+def voxel_env(seed: int) -> Any:
+    """Return the example, its agents with a second sensor: the way to the target in three voxels."""
     env = importlib.import_module("custom_env").make(seed, num_agents=4)
-    sensor = ObservationSpec(ROWS, (DimensionProperty.NONE,) * 2, ObservationType.DEFAULT, "rows")
+    sensor = ObservationSpec(VOXELS, (DimensionProperty.NONE,) * 4, ObservationType.DEFAULT, "voxels")
     env.spec = BehaviorSpec([*env.spec.observation_specs, sensor], env.spec.action_spec)
     get_steps = env.get_steps
 
-    def with_rows(name: str) -> Any:
+    def with_voxels(name: str) -> Any:
         results = get_steps(name)
         for steps in results:
-            steps.obs = [steps.obs[0], steps.obs[0][:, None].repeat(ROWS[0], axis=1)]
+            steps.obs = [steps.obs[0], steps.obs[0][:, None, None, None].repeat(VOXELS[0], axis=1)]
         return results
 
-    env.get_steps = with_rows
+    env.get_steps = with_voxels
     return env
 
 
 @pytest.fixture
-def rows_module(monkeypatch: pytest.MonkeyPatch) -> str:
+def voxel_module(monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.syspath_prepend(str(EXAMPLES))
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    return f"env.factory={__name__}:rows_env"
+    return f"env.factory={__name__}:voxel_env"
 
 
-def test_a_sensor_without_an_encoder_is_refused(rows_module: str, tmp_path: Path) -> None:
-    config = compose_config([*TINY, rows_module]).config
-    with pytest.raises(ConfigError, match=r"sensor obs_1 has shape \(3, 2\); vectors .* and images"):
+def test_a_sensor_without_an_encoder_is_refused(voxel_module: str, tmp_path: Path) -> None:
+    config = compose_config([*TINY, voxel_module]).config
+    with pytest.raises(ConfigError, match=r"sensor obs_1 has shape \(3, 1, 1, 2\); vectors .* and images"):
         train(config, tmp_path / "run")
 
 
 def test_an_encoder_for_a_new_shape_trains(
-    rows_module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    voxel_module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    layout = encoders.ObsLayout(2, (("obs_1", ROWS),))
+    layout = encoders.ObsLayout(2, (("obs_1", VOXELS),))
     monkeypatch.setattr(encoders.ObsLayout, "from_shapes", classmethod(lambda cls, *args: layout))
-    monkeypatch.setattr(encoders, "ImageEncoder", RowsEncoder)
-    assert encoders.Encoder(layout, True)(torch.zeros(5, 2), torch.zeros(5, *ROWS)).shape == (5, 130)
+    monkeypatch.setattr(encoders, "ImageEncoder", VoxelEncoder)
+    encoder = encoders.Encoder(layout, True)
+    assert encoder(torch.zeros(5, 2), torch.zeros(5, *VOXELS)).shape == (5, 9)
 
-    outcome = train(compose_config([*TINY, rows_module]).config, tmp_path / "run")
+    outcome = train(compose_config([*TINY, voxel_module]).config, tmp_path / "run")
     assert outcome.status == FINISHED and outcome.last_checkpoint is not None
     state = checkpoint.load(outcome.last_checkpoint)
     assert any("encoder.images.0.out" in key for key in state["learners"]["Point"]["actor"])

@@ -9,10 +9,17 @@ import torch
 from onnx_fakes import data_of, inputs, make
 
 from mappo_unity import keys
-from mappo_unity.config.schema import Activation, DistributionKind, MemoryKind, ModelConfig
+from mappo_unity.config.schema import (
+    Activation,
+    DistributionKind,
+    GoalKind,
+    MemoryKind,
+    ModelConfig,
+)
 from mappo_unity.learning.networks.actor_critic import make_actor
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
+from mappo_unity.learning.networks.images import MIN_SIDES
 from mappo_unity.policies.onnx_check import compare
 from mappo_unity.policies.onnx_graph import ExportError, build_model
 from mappo_unity.policies.onnx_policy import open_session
@@ -95,6 +102,22 @@ CASES = {
     "layer norms alone": ([[4]], 2, [], {"layer_norm": True, "normalize_obs": False}),
     "squashed": ([[8]], 2, [], {"action_distribution": DistributionKind.tanh_normal, "head_scale": 20}),
     "squashed, hybrid": ([[8]], 2, [3, 2], {"action_distribution": DistributionKind.tanh_normal}),
+    "entities": ([[5, 3]], 2, [], {}),
+    "entities and more": ([[4], [5, 3], [3, 22, 20], [7, 2], [2]], 2, [3], {}),
+    "entities, layer norms": ([[4], [5, 3]], 2, [], {"layer_norm": True}),
+    "goal": ([[4], [2], [6]], 2, [3], {"goals": [False, True, False], "goal_conditioning": GoalKind.hyper}),
+    "goals of every kind": (
+        *([[4], [3, 8, 8], [5, 3], [2]], 2, []),
+        {"goals": [False, True, True, True], "goal_conditioning": GoalKind.hyper, "layer_norm": True},
+    ),
+    "goal, one hidden layer": (
+        *([[4]], 2, []),
+        {"goals": [True], "goal_conditioning": GoalKind.hyper, "hidden": [16]},
+    ),
+    **{
+        f"image, {kind.value}": ([[3, side, side + 4], [side + 1, side, 1]], 2, [], {"image_encoder": kind})
+        for kind, side in MIN_SIDES.items()
+    },
     "image, channels last": ([[4], [22, 20, 3], [2]], 2, [], {}),
 }
 

@@ -23,14 +23,24 @@ from mappo_unity.training.setup import set_up
 GAMMA = 0.9
 
 
-def learn(probe, tmp_path, iterations=60, actions="discrete", model=None, ppo=None, rounds=8):
+def learn(
+    probe,
+    tmp_path,
+    iterations=60,
+    actions="discrete",
+    model=None,
+    ppo=None,
+    rounds=8,
+    factory="probes:make",
+    teams=16,
+):
     """Train on a probe; return what was set up, the last batch, and what followed it."""
     cfg = Config(
         env=EnvConfig(
             name="custom",
             backend=Backend.custom,
-            factory="probes:make",
-            params={"probe": probe, "actions": actions},
+            factory=factory,
+            params={"probe": probe, "actions": actions, "teams": teams},
         ),
         model=ModelConfig(**({"hidden": [32], "normalize_obs": False} | (model or {}))),
         ppo=PPOConfig(

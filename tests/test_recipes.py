@@ -88,6 +88,7 @@ def check(ours, theirs, behaviors=1):
     assert model.hidden == [net["hidden_units"]] * net["num_layers"] and model.critic_hidden is None
     assert model.normalize_obs == net["normalize"]
     assert model.critic is (CriticKind.poca if theirs["trainer_type"] == "poca" else CriticKind.local)
+    assert model.image_encoder.value == net["vis_encode_type"]
     memory = net.get("memory")
     assert model.memory is (MemoryKind.lstm if memory else MemoryKind.none)
     if memory:

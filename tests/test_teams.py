@@ -116,8 +116,6 @@ def test_images_are_encoded(shape):
     encoder = Encoder(layout, True)
     assert layout.keys == ["observation", "obs_1"]
     assert encoder(torch.zeros(2, 3, 4), torch.zeros(2, 3, *shape)).shape == (2, 3, encoder.size)
-    with pytest.raises(ConfigError, match="obs_1 has shape"):
-        ObsLayout.from_shapes([(4,), (20, 6)])
 
 
 def test_joint_branches_are_the_same_actions_under_one_categorical():

@@ -75,6 +75,24 @@ class MemoryKind(Enum):
     gru = "gru"
 
 
+class ImageKind(Enum):
+    """Layers between an image and its features."""
+
+    auto = "auto"
+    simple = "simple"
+    nature = "nature"
+    resnet = "resnet"
+    match3 = "match3"
+    dense = "dense"
+
+
+class GoalKind(Enum):
+    """How goal signals reach a network."""
+
+    none = "none"
+    hyper = "hyper"
+
+
 class RatioKind(Enum):
     """What the probability ratio is taken of and clipped for."""
 
@@ -282,6 +300,13 @@ class ModelConfig:
     action_distribution: DistributionKind = DistributionKind.gaussian
     """Continuous actions: a Gaussian that the environment clips, its deviation a weight of its own
     (gaussian), or a Gaussian squashed by tanh, its deviation an output of the network (tanh_normal)."""
+    image_encoder: ImageKind = ImageKind.auto
+    """Encoder of images and grids: ML-Agents' simple (from 20 x 20 on), nature (36), resnet (15), match3 (5)
+    or dense (any size), with as many features as the first hidden layer is wide; auto: convolutions that fit
+    the size, 128 features."""
+    goal_conditioning: GoalKind = GoalKind.none
+    """Sensors that are goal signals: observations like others (none), and, as ML-Agents' default has it, what
+    another network makes the weights of the last hidden layer of (hyper; actors and local critics)."""
     memory: MemoryKind = MemoryKind.none
     """Memory of the actor and the critic: lstm or gru, one layer before the heads; none: they see the newest
     observation only."""

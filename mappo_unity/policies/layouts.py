@@ -12,6 +12,7 @@ from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.protobuf import install
 from mappo_unity.scenes.contract.images import FIRST, LAST, channel_dim, guessed_channel_dim
+from mappo_unity.scenes.contract.sensors import is_goal
 
 # Before mlagents_envs: its messages do not load on a current protobuf without this.
 install()
@@ -19,7 +20,9 @@ install()
 from mlagents_envs.base_env import BehaviorSpec  # noqa: E402
 
 CHANNELS = "channel_dims"
-"""The entry of a layout that says where each sensor's channels stand, None for vectors."""
+"""The entry of a layout that says where each sensor's channels stand, None for what is no image."""
+GOALS = "goals"
+"""The entry of a layout that says of each sensor whether it is a goal signal."""
 
 
 def describe_spec(spec: BehaviorSpec, team_size: int) -> dict[str, Any]:
@@ -28,6 +31,7 @@ def describe_spec(spec: BehaviorSpec, team_size: int) -> dict[str, Any]:
         "team_size": team_size,
         "sensors": [list(o.shape) for o in spec.observation_specs],
         CHANNELS: [channel_dim(o) for o in spec.observation_specs],
+        GOALS: [is_goal(o) for o in spec.observation_specs],
         "continuous": int(spec.action_spec.continuous_size),
         "branches": [int(n) for n in spec.action_spec.discrete_branches],
     }
@@ -47,7 +51,7 @@ def guessed_otherwise(saved: Mapping[str, Any], found: Mapping[str, Any]) -> boo
 
 
 def without_channels(layout: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the layouts, by policy name, as older versions wrote them."""
+    """Return the layouts, by policy name, as versions wrote them that did not know channels."""
     return {
         name: {key: value for key, value in policy.items() if key != CHANNELS}
         for name, policy in layout.items()
@@ -55,10 +59,9 @@ def without_channels(layout: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def same_layout(saved: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
-    """Tell whether two layouts of a policy are the same; an older one does not tell its channels."""
-    if CHANNELS not in saved:
-        found = without_channels({"": found})[""]
-    return saved == found
+    """Tell whether two layouts of a policy are the same; an older one tells neither channels nor goals."""
+    untold = {CHANNELS, GOALS} - saved.keys()
+    return saved == {key: value for key, value in found.items() if key not in untold}
 
 
 def check_layout(owner: str, layout: Mapping[str, Any], behavior: str, spec: BehaviorSpec) -> None:
@@ -109,6 +112,8 @@ def _words(layout: Mapping[str, Any]) -> str:
     shapes = [str(shape) for shape in layout["sensors"]]
     for index, dim in enumerate(layout.get(CHANNELS, ())):
         shapes[index] += {None: "", FIRST: " (channels first)", LAST: " (channels last)"}[dim]
+    for index, goal in enumerate(layout.get(GOALS, ())):
+        shapes[index] += " (goal)" if goal else ""
     sensors = " and ".join(shapes) or "nothing"
     actions = [f"{layout['continuous']} continuous"] if layout["continuous"] else []
     actions += [f"discrete {layout['branches']}"] if layout["branches"] else []

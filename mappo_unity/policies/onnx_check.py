@@ -91,6 +91,8 @@ def _feed(
         if len(shape) == 1:
             feed[name] = arrays[keys.OBS][:, start : start + shape[0]]
             start += shape[0]
+        elif len(shape) == 2:
+            feed[name] = arrays[keys.SENSOR.format(index)]
         else:
             image = arrays[keys.SENSOR.format(index)]
             feed[name] = fit_image(image, shapes[name], next(images).channels_last)

@@ -3,7 +3,8 @@
 It is built node by node, not traced: it has the operators, names and shapes of the files that ML-Agents
 itself writes (opset 9, which Sentis and the Inference Engine import), whatever torch's own exporter does.
 
-    inputs   obs_0 ... obs_n  float32 [batch, size] or [batch, C, H, W], in the order of the sensors
+    inputs   obs_0 ... obs_n  float32 [batch, size], [batch, C, H, W] or [batch, entities, features], in
+                              the order of the sensors
              action_masks     float32 [batch, sum of branches], 1 = allowed; only with branches
              recurrent_in     only with a memory, see `onnx_memory`
     outputs  version_number, memory_size                   float32 [1]: 3; 0 or M
@@ -25,10 +26,11 @@ from mappo_unity import __version__
 from mappo_unity.config.option_table import with_article
 from mappo_unity.config.packages import PER_MEMBER, ExportError, import_package
 from mappo_unity.learning.networks.actor_critic import Actor, PerMember
-from mappo_unity.learning.networks.encoders import OBS_CLIP, Encoder
+from mappo_unity.learning.networks.encoders import OBS_CLIP
 from mappo_unity.learning.networks.recurrent import RecurrentActor
 from mappo_unity.policies.onnx_actions import BATCH, add_actions
 from mappo_unity.policies.onnx_memory import add_memory
+from mappo_unity.policies.onnx_sensors import add_sensors
 
 FORMAT = 3.0  # ML-Agents' ModelApiVersion.MLAgents2_0: an input for each sensor, actions drawn in the graph
 OPSET, IR_VERSION = 9, 4  # those of the files that ML-Agents writes
@@ -40,7 +42,7 @@ def build_model(
     """Build the graph of an actor.
 
     Args:
-        actor: the network (`models.Actor`); it takes all vector sensors in one, then every image.
+        actor: the network (`models.Actor`); it takes all vector sensors in one, then images, then sets.
         sensors: shape of every sensor, without the batch.
         name: the behavior's name, which the graph bears.
         metadata: what else the file tells of itself.
@@ -62,7 +64,7 @@ def build_model(
     *body, head = [*network.net, actor.head] if isinstance(actor, RecurrentActor) else network.net
     if not isinstance(head, nn.Linear):
         raise ExportError(f"the policy network ends in {with_article(type(head).__name__)}, not in a Linear")
-    hidden = graph.layers(body, _features(graph, network.encoder, sensors), "net")
+    hidden = graph.layers(body, add_sensors(graph, network.encoder, sensors), "net")
     if memory is not None:
         hidden = add_memory(graph, memory, hidden, BATCH)
     add_actions(graph, hidden, head, network)
@@ -128,6 +130,14 @@ class Graph:
         inputs = [x, self.constant(f"{name}.weight", weight), self.constant(f"{name}.bias", bias)]
         return self.node("Gemm", inputs, alpha=1.0, beta=1.0, transB=1)
 
+    def norm_rows(self, x: str, eps: float, axis: int, name: str) -> str:
+        """Add a layer norm without weights over an axis, of operators that opset 9 has."""
+        centred = self.node("Sub", [x, self.node("ReduceMean", [x], axes=[axis], keepdims=1)])
+        square = self.node("Mul", [centred, centred])
+        var = self.node("ReduceMean", [square], axes=[axis], keepdims=1)
+        std = self.node("Sqrt", [self.node("Add", [var, self.constant(f"{name}.eps", eps)])])
+        return self.node("Div", [centred, std])
+
     def layers(self, layers: Sequence[nn.Module], x: str, name: str) -> str:
         """Add layers one after the other."""
         for index, layer in enumerate(layers):
@@ -166,15 +176,36 @@ def _conv(graph: Graph, layer: Any, x: str, name: str) -> str:
     return graph.node("Conv", inputs, pads=[*layer.padding, *layer.padding], group=1, **sizes)  # begins, ends
 
 
+def _max_pool(graph: Graph, layer: Any, x: str, name: str) -> str:
+    size, stride = layer.kernel_size, layer.stride
+    return graph.node("MaxPool", [x], kernel_shape=[size, size], strides=[stride, stride])
+
+
 def _layer_norm(graph: Graph, layer: Any, x: str, name: str) -> str:
-    # of operators that opset 9 has
-    centred = graph.node("Sub", [x, graph.node("ReduceMean", [x], axes=[1], keepdims=1)])
-    square = graph.node("Mul", [centred, centred])
-    var = graph.node("ReduceMean", [square], axes=[1], keepdims=1)
-    std = graph.node("Sqrt", [graph.node("Add", [var, graph.constant(f"{name}.eps", layer.eps)])])
-    normed = graph.node("Div", [centred, std])
+    normed = graph.norm_rows(x, layer.eps, 1, name)
+    if layer.weight is None:
+        return normed
     scaled = graph.node("Mul", [normed, graph.constant(f"{name}.weight", layer.weight)])
     return graph.node("Add", [scaled, graph.constant(f"{name}.bias", layer.bias)])
+
+
+def _residual(graph: Graph, layer: Any, x: str, name: str) -> str:
+    return graph.node("Add", [x, graph.layer(layer.layers, x, name)])
+
+
+def _conditioned(graph: Graph, layer: Any, x: str, name: str) -> str:
+    columns = graph.constant(f"{name}.columns", layer.columns, np.int64)
+    goal = graph.node("Gather", [x, columns], axis=1)
+    hyper = layer.hyper
+    flat = graph.layer(hyper.weights, goal, f"{name}.weights")
+    shape = graph.constant(f"{name}.shape", [0, hyper.size, hyper.out_features], np.int64)
+    weights = graph.node("Reshape", [flat, shape])
+
+    before = graph.layer(layer.before, x, f"{name}.before")
+    row = graph.node("Unsqueeze", [before], axes=[1])
+    product = graph.node("Squeeze", [graph.node("MatMul", [row, weights])], axes=[1])
+    out = graph.node("Add", [product, graph.constant(f"{name}.bias", hyper.bias)])
+    return graph.layer(layer.activation, out, f"{name}.activation")
 
 
 _LAYERS: dict[str, Callable[[Graph, Any, str, str], str]] = {
@@ -184,9 +215,13 @@ _LAYERS: dict[str, Callable[[Graph, Any, str, str], str]] = {
     "Sequential": lambda graph, layer, x, name: graph.layers(list(layer), x, name),
     "Linear": lambda graph, layer, x, name: graph.gemm(x, layer.weight, layer.bias, name),
     "Conv2d": _conv,
+    "MaxPool2d": _max_pool,
+    "ResidualBlock": _residual,
+    "GoalConditioned": _conditioned,
     "Flatten": lambda graph, layer, x, name: graph.node("Flatten", [x], axis=1),
     "Tanh": lambda graph, layer, x, name: graph.node("Tanh", [x]),
     "ReLU": lambda graph, layer, x, name: graph.node("Relu", [x]),
+    "LeakyReLU": lambda graph, layer, x, name: graph.node("LeakyRelu", [x], alpha=layer.negative_slope),
     "SiLU": lambda graph, layer, x, name: graph.node("Mul", [x, graph.node("Sigmoid", [x])]),
     "ELU": lambda graph, layer, x, name: graph.node("Elu", [x], alpha=float(layer.alpha)),
 }
@@ -203,29 +238,3 @@ def _check_network(actor: nn.Module) -> Actor:
             "an encoder followed by an MLP can"
         )
     return actor
-
-
-def _features(graph: Graph, encoder: Encoder, sensors: Sequence[Sequence[int]]) -> str:
-    """Add the inputs and what encodes them; return what the MLP takes."""
-    vectors, features = [], []
-    images = iter(encoder.images)
-    for index, shape in enumerate(sensors):
-        name = f"obs_{index}"
-        if len(shape) == 1:
-            vectors.append(graph.input(name, shape))
-            continue
-        image: Any = next(images)
-        x = graph.input(name, channels_first(shape) if image.channels_last else shape)
-        x = graph.layer(image.conv, x, f"{name}.conv")
-        features.append(graph.layer(image.out, x, f"{name}.out"))
-
-    # The MLP takes the vectors first, wherever their sensors stand.
-    if vectors:
-        features.insert(0, graph.layer(encoder.norm, graph.node("Concat", vectors, axis=1), "norm"))
-    return graph.node("Concat", features, axis=1) if len(features) > 1 else features[0]
-
-
-def channels_first(shape: Sequence[int]) -> tuple[int, ...]:
-    """Turn the shape ``H, W, C`` of an image into ``C, H, W``, as Unity's models take it."""
-    height, width, channels = shape
-    return channels, height, width

@@ -18,7 +18,7 @@ from mappo_unity.config.schema import ModelConfig, bounded_log_std
 from mappo_unity.learning.networks.actor_critic import PerMember, make_actor
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
-from mappo_unity.policies.layouts import CHANNELS, check_layout
+from mappo_unity.policies.layouts import CHANNELS, GOALS, check_layout
 from mappo_unity.policies.members import MemberTable, Places, team_places
 from mappo_unity.runs import checkpoint
 
@@ -173,7 +173,7 @@ class CheckpointPolicy(ActorPolicy):
 def _inputs(steps: DecisionSteps, spec: BehaviorSpec) -> dict[str, np.ndarray]:
     """The entries of a network's input, a row for each agent."""
     shapes = [o.shape for o in spec.observation_specs]
-    entries = {keys.SENSOR.format(i): o for i, o in enumerate(steps.obs) if len(shapes[i]) == 3}
+    entries = {keys.SENSOR.format(i): o for i, o in enumerate(steps.obs) if len(shapes[i]) != 1}
 
     vectors = [o for o, shape in zip(steps.obs, shapes) if len(shape) == 1]
     if vectors:
@@ -203,7 +203,7 @@ def _actor(state: dict[str, Any], name: str) -> Any:
     )
 
     # what an older checkpoint does not tell is guessed, as it was then
-    obs = ObsLayout.from_shapes(layout["sensors"], layout.get(CHANNELS))
+    obs = ObsLayout.from_shapes(layout["sensors"], layout.get(CHANNELS), layout.get(GOALS))
     actor = make_actor(obs, actions, layout["team_size"], model)
     actor.load_state_dict(state["learners"][name]["actor"])
     return actor.eval()

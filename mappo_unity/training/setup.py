@@ -29,6 +29,7 @@ from mappo_unity.learning.imitation.expert import Expert, make_expert
 from mappo_unity.learning.networks.actor_critic import JointPolicy, make_actor, make_critic
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
+from mappo_unity.learning.networks.images import check_sides
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.rewards.streams import RewardStreams, make_intrinsic
 from mappo_unity.runs.folder import PLAYERS
@@ -223,6 +224,7 @@ def make_learners(
         if guess_channels:
             obs = ObsLayout.from_shapes([sensor.shape for sensor in sensors])
         note_unmarked(name, sensors, note)
+        check_sides(name, sensors, model.image_encoder)
         layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
         check_network_memory(name, obs, layout, team_size, model)
 

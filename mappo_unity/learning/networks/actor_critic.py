@@ -22,6 +22,7 @@ from mappo_unity.config.schema import LOG_STD_RANGE, CriticKind, DistributionKin
 from mappo_unity.learning.networks.critics import CentralCritic, LocalCritic, PooledCritic
 from mappo_unity.learning.networks.distributions import ActionDistribution, ActionLayout, state_log_std
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
+from mappo_unity.learning.networks.goals import condition_on_goals
 from mappo_unity.learning.networks.mlp import apply_options, init_head, make_mlp
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import RecurrentActor, RecurrentCritic, output_size
@@ -32,11 +33,12 @@ class Actor(nn.Module):
 
     def __init__(self, obs: ObsLayout, layout: ActionLayout, cfg: ModelConfig) -> None:
         super().__init__()
-        self.encoder = Encoder(obs, cfg.normalize_obs)
+        self.encoder = Encoder(obs, cfg.normalize_obs, cfg.image_encoder, cfg.hidden[0])
 
         outputs = layout.num_means + layout.num_logits
         # the small last gain makes first actions almost independent of what is observed
         self.net = make_mlp(self.encoder.size, list(cfg.hidden), outputs, cfg.activation, last_gain=0.01)
+        condition_on_goals(self, cfg)
 
         self.layout, self.init_log_std = layout, float(cfg.init_log_std)
         apply_options(self, cfg, layout.num_means)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from mappo_unity.config.schema import CriticKind, ModelConfig
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
+from mappo_unity.learning.networks.goals import condition_on_goals
 from mappo_unity.learning.networks.mlp import ACTIVATIONS, linear, make_mlp
 
 ATTENTION_HEADS = 4
@@ -37,9 +38,10 @@ class LocalCritic(Critic):
 
     def __init__(self, obs: ObsLayout, cfg: ModelConfig, streams: int = 1) -> None:
         super().__init__()
-        self.encoder = Encoder(obs, cfg.normalize_obs)
         hidden = list(cfg.critic_hidden or cfg.hidden)
+        self.encoder = Encoder(obs, cfg.normalize_obs, cfg.image_encoder, hidden[0])
         self.net = make_mlp(self.encoder.size, hidden, streams, cfg.activation, last_gain=CRITIC_GAIN)
+        condition_on_goals(self, cfg)
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return values."""
@@ -55,8 +57,8 @@ class CentralCritic(Critic):
 
     def __init__(self, obs: ObsLayout, team_size: int, cfg: ModelConfig, streams: int = 1) -> None:
         super().__init__()
-        self.encoder = Encoder(obs, cfg.normalize_obs)
         first, *rest = list(cfg.critic_hidden or cfg.hidden)
+        self.encoder = Encoder(obs, cfg.normalize_obs, cfg.image_encoder, first)
         self.joint = linear(team_size * (self.encoder.size + 1), first, 2**0.5)
         self.member = nn.Parameter(torch.randn(team_size, first) * 0.1)
         self.activation = ACTIVATIONS[cfg.activation]()
@@ -75,8 +77,8 @@ class PooledCritic(Critic):
 
     def __init__(self, obs: ObsLayout, team_size: int, cfg: ModelConfig, streams: int = 1) -> None:
         super().__init__()
-        self.encoder = Encoder(obs, cfg.normalize_obs)
         first, *rest = list(cfg.critic_hidden or cfg.hidden)
+        self.encoder = Encoder(obs, cfg.normalize_obs, cfg.image_encoder, first)
 
         # attention wants a width that its heads divide
         first += -first % ATTENTION_HEADS

@@ -1,7 +1,8 @@
-"""Observations of one agent to features: normalised vectors and encoded images.
+"""Observations of one agent to features: normalised vectors, encoded images, entities that attend.
 
-Vectors ``[..., O]`` and images ``[..., C, H, W]`` become features ``[..., F]``. Normalisation is part of the
-module, so that it is saved and exported with the network.
+Vectors ``[..., O]``, images ``[..., C, H, W]`` and sets of entities ``[..., N, F]`` become features
+``[..., F]``. Normalisation, of vectors only, is part of the module, so that it is saved and exported with the
+network.
 """
 
 from __future__ import annotations
@@ -14,27 +15,39 @@ from mlagents_envs.base_env import ObservationSpec
 from torch import Tensor, nn
 
 from mappo_unity import keys
+from mappo_unity.config.schema import ImageKind
 from mappo_unity.errors import ConfigError
-from mappo_unity.scenes.contract.images import FIRST, LAST, channel_dim, guessed_channel_dim
+from mappo_unity.learning.networks.attention import ENTITY_FEATURES, EntityEncoder
+from mappo_unity.learning.networks.images import IMAGE_FEATURES, ImageEncoder
+from mappo_unity.scenes.contract.images import FIRST, channel_dim, guessed_channel_dim
+from mappo_unity.scenes.contract.sensors import is_goal, is_set
 
 OBS_CLIP = 5.0  # ML-Agents clips normalised observations to +-5
-IMAGE_FEATURES = 128
 
 
 @dataclass(frozen=True)
 class ObsLayout:
-    """Sizes of an agent's observation: all vectors in one, every image (or grid) by itself.
+    """Sizes of an agent's observation: all vectors in one, every image (or grid) and set by itself.
 
     `channel_dims`: of each image the dimension of its channels, 0 or 2; none given: 0 of all of them.
+    `sets`: sensors of variable length, ``[N, F]``: up to N entities of F features.
+    `goal_vectors`: which columns of the vectors are goal signals, as pairs of first and behind the last.
+    `goal_keys`: which images and sets are.
     """
 
     vector: int
     images: tuple[tuple[str, tuple[int, ...]], ...] = ()
     channel_dims: tuple[int, ...] = ()
+    sets: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    goal_vectors: tuple[tuple[int, int], ...] = ()
+    goal_keys: tuple[str, ...] = ()
 
     @classmethod
     def from_shapes(
-        cls, shapes: Sequence[Sequence[int]], channel_dims: Sequence[int | None] | None = None
+        cls,
+        shapes: Sequence[Sequence[int]],
+        channel_dims: Sequence[int | None] | None = None,
+        goals: Sequence[bool] | None = None,
     ) -> ObsLayout:
         """Read the layout from the sensors' shapes, in their order.
 
@@ -42,36 +55,64 @@ class ObsLayout:
             shapes: of all sensors.
             channel_dims: for each sensor, as `channel_dim` returns it; None: they are guessed from the
                 shapes, as for older checkpoints, which do not tell.
+            goals: for each sensor, whether it is a goal signal; None: none is.
 
         Raises:
-            ConfigError: a sensor is neither a vector nor an image.
+            ConfigError: a sensor is neither a vector, nor a set, nor an image.
         """
-        for index, shape in enumerate(shapes):
-            if len(shape) not in (1, 3):
+        entries = [(keys.SENSOR.format(i), tuple(shape)) for i, shape in enumerate(shapes)]
+        for key, shape in entries:
+            if len(shape) not in (1, 2, 3):
                 raise ConfigError(
-                    f"sensor obs_{index} has shape {tuple(shape)}; vectors (1 dimension) and images or grids "
-                    "(3 dimensions) can be learned from, variable-length buffers cannot yet"
+                    f"sensor {key} has shape {shape}; vectors (1 dimension), entities of varying number (2) "
+                    "and images or grids (3) can be learned from"
                 )
+        goal_keys = [key for (key, _), goal in zip(entries, goals or ()) if goal]
 
-        images = [(keys.SENSOR.format(i), tuple(s)) for i, s in enumerate(shapes) if len(s) == 3]
+        vector = 0
+        goal_vectors: list[tuple[int, int]] = []
+        for key, (size, *rest) in entries:
+            if not rest:
+                goal_vectors += [(vector, vector + size)] if key in goal_keys else []
+                vector += size
+
+        images, sets = (tuple(entry for entry in entries if len(entry[1]) == n) for n in (3, 2))
         dims = [guessed_channel_dim(tuple(s)) for s in shapes] if channel_dims is None else channel_dims
-        vector = sum(s[0] for s in shapes if len(s) == 1)
-        return cls(vector, tuple(images), tuple(dim for dim in dims if dim is not None))
+        return cls(
+            vector,
+            images,
+            tuple(dim for dim in dims if dim is not None),
+            sets,
+            tuple(goal_vectors),
+            tuple(key for key, _ in (*images, *sets) if key in goal_keys),
+        )
 
     @classmethod
     def from_specs(cls, specs: Sequence[ObservationSpec]) -> ObsLayout:
-        """Read the layout from observation specs."""
-        return cls.from_shapes([spec.shape for spec in specs], [channel_dim(spec) for spec in specs])
+        """Read the layout from observation specs.
+
+        Raises:
+            ConfigError: as `from_shapes`; rows are not marked as of varying number.
+        """
+        for index, spec in enumerate(specs):
+            if len(spec.shape) == 2 and not is_set(spec):
+                raise ConfigError(
+                    f"sensor obs_{index} ({spec.name}) has shape {tuple(spec.shape)}, but does not say that "
+                    "its rows are entities of varying number, as dimension_property=(VARIABLE_SIZE, NONE) "
+                    "does (in Unity: a BufferSensor); a table of fixed size must be sent as a vector"
+                )
+        goals = [is_goal(spec) for spec in specs]
+        return cls.from_shapes([spec.shape for spec in specs], [channel_dim(spec) for spec in specs], goals)
 
     @property
     def keys(self) -> list[str]:
         """Entries that networks read, in the order of `Encoder.forward`'s arguments."""
-        return ([keys.OBS] if self.vector else []) + [key for key, _ in self.images]
+        return ([keys.OBS] if self.vector else []) + [key for key, _ in (*self.images, *self.sets)]
 
     @property
     def team_dims(self) -> list[int]:
         """Where the members of a team stand in each of these entries, counted from the end."""
-        return ([-2] if self.vector else []) + [-4 for _ in self.images]
+        return ([-2] if self.vector else []) + [-1 - len(shape) for _, shape in (*self.images, *self.sets)]
 
 
 class RunningNorm(nn.Module):
@@ -124,24 +165,51 @@ class RunningNorm(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Observation entries of an agent to its features ``[..., F]``."""
+    """Observation entries of an agent to its features ``[..., F]``: vectors, then images, then entities.
 
-    def __init__(self, layout: ObsLayout, normalize: bool) -> None:
+    Args:
+        layout: the entries.
+        normalize: whether vectors are normalised.
+        kind: the encoder of images.
+        width: features of an image where ML-Agents' encoders encode it: those of the first hidden layer.
+
+    Attributes: `size`, F; `goal_columns`, those of the F that are goal signals.
+    """
+
+    def __init__(
+        self,
+        layout: ObsLayout,
+        normalize: bool,
+        kind: ImageKind = ImageKind.auto,
+        width: int = IMAGE_FEATURES,
+    ) -> None:
         super().__init__()
         self.norm: nn.Module = RunningNorm(layout.vector) if normalize and layout.vector else nn.Identity()
         dims = layout.channel_dims or (FIRST,) * len(layout.images)
-        self.images = nn.ModuleList([ImageEncoder(s, dim) for (_, s), dim in zip(layout.images, dims)])
+        images = [ImageEncoder(s, dim, kind, width) for (_, s), dim in zip(layout.images, dims)]
+        self.images = nn.ModuleList(images)
         self.vector, self.has_vector = layout.vector, layout.vector > 0
-        self.size = layout.vector + IMAGE_FEATURES * len(layout.images)
+
+        widths = [(key, net.size) for (key, _), net in zip(layout.images, images)]
+        around = layout.vector + sum(size for _, size in widths)
+        sizes = [shape[1] for _, shape in layout.sets]
+        self.sets = EntityEncoder(sizes, around) if sizes else None
+        self.size = around + (ENTITY_FEATURES if sizes else 0)
+        self.goal_columns = _goal_columns(layout, widths)
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return features; the arguments come in the order of `ObsLayout.keys`."""
-        if not len(self.images):
+        if not len(self.images) and self.sets is None:
             return self.norm(obs[0])
 
+        first = int(self.has_vector)
+        behind = first + len(self.images)
         parts = [self.norm(obs[0])] if self.has_vector else []
-        images = obs[1:] if self.has_vector else obs
-        return torch.cat(parts + [net(in_floats(image)) for net, image in zip(self.images, images)], -1)
+        parts += [net(in_floats(image)) for net, image in zip(self.images, obs[first:behind])]
+        if self.sets is not None:
+            around = torch.cat(parts, -1) if parts else None
+            parts.append(self.sets(around, obs[behind:]))
+        return torch.cat(parts, -1)
 
 
 def in_floats(image: Tensor) -> Tensor:
@@ -157,39 +225,18 @@ def in_type(image: Tensor, dtype: torch.dtype) -> Tensor:
     return in_floats(image) if dtype != torch.uint8 else (image * 255).round().to(dtype)
 
 
-class ImageEncoder(nn.Module):
-    """Two convolutions and a linear layer, as ML-Agents' "simple" encoder; 3x3 ones on small images.
+def _goal_columns(layout: ObsLayout, images: list[tuple[str, int]]) -> list[int]:
+    """Return the columns of features that are goals; entities share their columns.
 
     Args:
-        shape: of an image.
-        channel_dim: 0 for ``C, H, W`` (Unity since package 3.0), 2 for ``H, W, C`` (before).
+        layout: the entries.
+        images: key and features of each.
     """
-
-    def __init__(self, shape: tuple[int, ...], channel_dim: int = FIRST) -> None:
-        super().__init__()
-        self.channels_last = channel_dim == LAST
-        channels, height, width = (shape[2], *shape[:2]) if self.channels_last else shape
-
-        if min(height, width) >= 20:
-            convolutions = [nn.Conv2d(channels, 16, 8, 4), nn.SiLU(), nn.Conv2d(16, 32, 4, 2), nn.SiLU()]
-        else:
-            convolutions = [
-                nn.Conv2d(channels, 16, 3, 1, 1),
-                nn.SiLU(),
-                nn.Conv2d(16, 32, 3, 2, 1),
-                nn.SiLU(),
-            ]
-
-        self.conv = nn.Sequential(*convolutions, nn.Flatten())
-
-        # the convolutions themselves tell the size of their features
-        with torch.no_grad():
-            flat = self.conv(torch.zeros(1, channels, height, width)).shape[1]
-        self.out = nn.Sequential(nn.Linear(flat, IMAGE_FEATURES), nn.SiLU())
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Return features ``[..., 128]`` of images ``[..., C, H, W]`` (or ``[..., H, W, C]``)."""
-        # convolutions take a single batch dimension
-        flat = image.flatten(0, -4)
-        flat = flat.permute(0, 3, 1, 2) if self.channels_last else flat
-        return self.out(self.conv(flat)).unflatten(0, image.shape[:-3])
+    columns = [column for begin, end in layout.goal_vectors for column in range(begin, end)]
+    start = layout.vector
+    for key, size in images:
+        columns += range(start, start + size) if key in layout.goal_keys else []
+        start += size
+    if any(key in layout.goal_keys for key, _ in layout.sets):
+        columns += range(start, start + ENTITY_FEATURES)
+    return columns

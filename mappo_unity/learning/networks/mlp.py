@@ -10,7 +10,10 @@ import torch
 from torch import nn
 
 from mappo_unity.config.schema import Activation, ModelConfig, WeightInit
-from mappo_unity.learning.networks.encoders import Encoder, ImageEncoder, RunningNorm
+from mappo_unity.learning.networks.attention import EntityEncoder
+from mappo_unity.learning.networks.encoders import Encoder, RunningNorm
+from mappo_unity.learning.networks.goals import HyperLinear
+from mappo_unity.learning.networks.images import ImageEncoder
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {
     Activation.tanh: nn.Tanh,
@@ -83,7 +86,7 @@ def init_head(layer: nn.Linear, cfg: ModelConfig, continuous: int | None = None)
 
 @torch.no_grad()
 def init_kaiming(net: nn.Module) -> None:
-    """Draw hidden weights as ML-Agents does; `PocaCritic` does so itself, attention keeps torch's."""
+    """Draw hidden weights as ML-Agents does; parts with a scheme of their own, attention too, keep it."""
     for layer in _linears(net):
         nn.init.kaiming_normal_(layer.weight, nonlinearity="linear")
         nn.init.zeros_(layer.bias)
@@ -97,25 +100,25 @@ def init_kaiming(net: nn.Module) -> None:
 def add_layer_norms(net: nn.Module) -> None:
     """Put a LayerNorm on vector observations and behind every activation that follows a Linear."""
     activations = tuple(ACTIVATIONS.values())
-    images = _inside(net, ImageEncoder)
+    apart = _inside(net, ImageEncoder, EntityEncoder, HyperLinear)
     for parent in list(net.modules()):
         if isinstance(parent, Encoder) and parent.has_vector:
             parent.norm = nn.Sequential(parent.norm, nn.LayerNorm(parent.vector))
 
         width = None
         for name, part in list(parent.named_children()):
-            if isinstance(part, nn.Linear):
+            if isinstance(part, (nn.Linear, HyperLinear)):
                 width = part.out_features
-            elif isinstance(part, activations) and width is not None and part not in images:
+            elif isinstance(part, activations) and width is not None and part not in apart:
                 setattr(parent, name, nn.Sequential(part, nn.LayerNorm(width)))
 
 
 def _linears(net: nn.Module) -> list[nn.Linear]:
-    """The Linear layers of a network in the order in which they were made, without attention's own."""
-    attention = _inside(net, nn.MultiheadAttention)
-    return [part for part in net.modules() if isinstance(part, nn.Linear) and part not in attention]
+    """The Linear layers of a network in the order in which they were made, without those of parts apart."""
+    apart = _inside(net, nn.MultiheadAttention, EntityEncoder, HyperLinear)
+    return [part for part in net.modules() if isinstance(part, nn.Linear) and part not in apart]
 
 
-def _inside(net: nn.Module, kind: type[nn.Module]) -> set[nn.Module]:
-    """All parts of the parts of a kind."""
-    return {inner for part in net.modules() if isinstance(part, kind) for inner in part.modules()}
+def _inside(net: nn.Module, *kinds: type[nn.Module]) -> set[nn.Module]:
+    """All parts of the parts of these kinds."""
+    return {inner for part in net.modules() if isinstance(part, kinds) for inner in part.modules()}

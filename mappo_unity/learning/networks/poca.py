@@ -15,17 +15,19 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import layer_norm, one_hot
+from torch.nn.functional import one_hot
 
 from mappo_unity.config.schema import ModelConfig
+from mappo_unity.learning.networks.attention import (
+    EMBEDDING_GAIN,
+    HEADS,
+    ResidualSelfAttention,
+    embedding,
+)
 from mappo_unity.learning.networks.critics import seen_features
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
 from mappo_unity.learning.networks.mlp import ACTIVATIONS
-
-HEADS = 4
-ABSENT = -1e6  # score of an entity that is not there; finite, so that a team of nobody gives numbers
-EMBEDDING_GAIN = 0.125  # initial weights have variance 0.125 / width (T-Fixup, as ML-Agents)
 
 
 class PocaCritic(nn.Module):
@@ -55,15 +57,15 @@ class PocaCritic(nn.Module):
     ) -> None:
         super().__init__()
         self.layout, self.team_size = layout, team_size
-        self.encoder = Encoder(obs, cfg.normalize_obs)
-
         widths = list(cfg.critic_hidden or cfg.hidden)
+        self.encoder = Encoder(obs, cfg.normalize_obs, cfg.image_encoder, widths[0])
+
         width = widths[0] + -widths[0] % HEADS
         actions = layout.continuous + sum(layout.branches)
         activation = ACTIVATIONS[cfg.activation]
 
-        self.observed = nn.Sequential(_embedding(self.encoder.size, width), activation())
-        self.acted = nn.Sequential(_embedding(self.encoder.size + actions, width), activation())
+        self.observed = nn.Sequential(embedding(self.encoder.size, width), activation())
+        self.acted = nn.Sequential(embedding(self.encoder.size + actions, width), activation())
         self.attention = ResidualSelfAttention(width)
 
         layers: list[nn.Module] = []
@@ -132,50 +134,12 @@ class PocaCritic(nn.Module):
         return torch.cat([hidden, count], -1)
 
 
-class ResidualSelfAttention(nn.Module):
-    """Entities ``[..., N, h]`` that attend to each other, to their mean ``[..., h]``.
-
-    Layer norms have no weights; scores are divided by the root of the whole width, not of a head's.
-    """
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.width = width
-        self.query, self.key = _embedding(width, width), _embedding(width, width)
-        self.content, self.out = _embedding(width, width), _embedding(width, width)
-
-    def forward(self, entities: Tensor, seen: Tensor) -> Tensor:
-        """Return the mean over the entities that are there; ``seen`` ``[..., N]`` is 1 for them, else 0."""
-        x = layer_norm(entities, (self.width,))
-        query, key, content = (self._heads(net(x)) for net in (self.query, self.key, self.content))
-
-        scores = query @ key.transpose(-1, -2) / self.width**0.5  # [..., heads, N, N]
-        absent = (seen == 0).unsqueeze(-2).unsqueeze(-2)
-        weights = scores.masked_fill(absent, ABSENT).softmax(-1)
-        attended = (weights @ content).transpose(-2, -3).flatten(-2)
-
-        out = layer_norm(self.out(attended) + x, (self.width,))
-        total = (out * seen.unsqueeze(-1)).sum(-2)
-        return total / seen.sum(-1, keepdim=True).clamp_min(1.0)
-
-    def _heads(self, x: Tensor) -> Tensor:
-        """Turn ``[..., N, h]`` into ``[..., heads, N, h / heads]``."""
-        return x.unflatten(-1, (HEADS, self.width // HEADS)).transpose(-2, -3)
-
-
 def flat_actions(action: Tensor, layout: ActionLayout) -> Tensor:
     """Return actions ``[..., C + K]`` as floats ``[..., C + sum of branches]``: each branch one-hot."""
     parts = [action[..., : layout.continuous].to(torch.get_default_dtype())]
     for column, size in enumerate(layout.branches, layout.continuous):
         parts.append(one_hot(action[..., column].long(), size).to(parts[0].dtype))
     return torch.cat(parts, -1)
-
-
-def _embedding(size: int, width: int) -> nn.Linear:
-    layer = nn.Linear(size, width)
-    nn.init.normal_(layer.weight, std=(EMBEDDING_GAIN / width) ** 0.5)
-    nn.init.zeros_(layer.bias)
-    return layer
 
 
 def _trunk_layer(size: int, outputs: int, width: int) -> nn.Linear:

@@ -38,7 +38,9 @@ class Sensor:
     stack: int = 1
     """Frames shown at once, concatenated along the first axis, oldest first."""
     dimension_property: tuple[DimensionProperty, ...] | None = None
-    """One flag a dimension; None: NONE for every dimension."""
+    """One flag a dimension; None: NONE for every dimension. Rows of varying number: (VARIABLE_SIZE, NONE)."""
+    observation_type: ObservationType = ObservationType.DEFAULT
+    """What is observed, or a goal signal."""
     in_bytes: bool = False
     """Whether every number is k / 255 for a byte k, as in a picture or a grid of 0 and 1: see `ByteImage`."""
 
@@ -48,7 +50,7 @@ class Sensor:
         flags = self.dimension_property or (DimensionProperty.NONE,) * len(shape)
         name = self.name if self.stack == 1 else f"StackingSensor_size{self.stack}_{self.name}"
         kind = ByteImage if self.in_bytes else ObservationSpec
-        return kind(shape, flags, ObservationType.DEFAULT, name)
+        return kind(shape, flags, self.observation_type, name)
 
 
 @dataclass(frozen=True)
