@@ -16,9 +16,6 @@ from mlagents_envs import __version__ as MLAGENTS_VERSION
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
 from mlagents_envs.side_channel import SideChannel
-from mlagents_envs.side_channel.engine_configuration_channel import EngineConfigurationChannel
-from mlagents_envs.side_channel.environment_parameters_channel import EnvironmentParametersChannel
-from mlagents_envs.side_channel.side_channel_manager import SideChannelManager
 
 from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.decode import ActionEncoder, BehaviorDecoder, MalformedMessage, behavior_spec
@@ -32,7 +29,9 @@ from mappo_unity.protocol.player_failures import (
 from mappo_unity.protocol.player_options import PlayerOptions
 from mappo_unity.protocol.process import PlayerProcess
 from mappo_unity.protocol.server import Link, LinkTimeout
+from mappo_unity.protocol.side_channels import TrainerChannels
 from mappo_unity.scenes.contract.images import sends_channels_last
+from mappo_unity.scenes.contract.statistics import Statistics
 
 CLOSE_S = 5.0  # how long a player may take to leave before it is killed
 
@@ -56,12 +55,7 @@ class UnityPlayer(BaseEnv):
     ) -> None:
         self.options, self.seed = options, seed
 
-        parameters, engine = EnvironmentParametersChannel(), EngineConfigurationChannel()
-        engine.set_configuration_parameters(**options.engine)
-        self._engine = engine
-        for name, value in options.parameters.items():
-            parameters.set_float_parameter(name, value)
-        self._channels = SideChannelManager([parameters, engine, *(side_channels or [])])
+        self._channels = TrainerChannels(options.parameters, options.engine, side_channels or [])
 
         self._decoders: dict[str, BehaviorDecoder] = {}
         self._encoders: dict[str, ActionEncoder] = {}
@@ -151,7 +145,11 @@ class UnityPlayer(BaseEnv):
 
     def set_time_scale(self, scale: float) -> None:
         """Let the player run so much faster than real time, from the next step on."""
-        self._engine.set_configuration_parameters(time_scale=scale)
+        self._channels.engine.set_configuration_parameters(time_scale=scale)
+
+    def pop_statistics(self) -> Statistics:
+        """Return what the game reported of itself (StatsRecorder) since the last call."""
+        return self._channels.pop_statistics()
 
     # ---- BaseEnv ------------------------------------------------------------------------------------------
 

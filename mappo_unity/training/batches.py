@@ -14,6 +14,7 @@ from mappo_unity import keys
 from mappo_unity.config.schema import CollectConfig
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.scenes.contract.statistics import Statistics
 from mappo_unity.training.crashed_episodes import mask_crashed_episodes
 
 
@@ -26,6 +27,7 @@ class Batch:
         episodes: those that finished, for each behavior.
         void: by policy name bool ``[..., A, 1]``, slots whose episode a crash cut off that had begun before
             the batch: what is pending of them teaches nothing.
+        statistics: what the environment reported of itself, see `UnityEnv.pop_statistics`.
         restarts: how often players have been started again so far; None: there are no players.
         dropped_episodes, dropped_steps: what crashes cost in this batch.
     """
@@ -33,6 +35,7 @@ class Batch:
     rounds: TensorDictBase
     episodes: dict[str, list[Episode]]
     void: dict[str, Tensor] = field(default_factory=dict)
+    statistics: Statistics = field(default_factory=dict)
     restarts: int | None = None
     dropped_episodes: int = 0
     dropped_steps: int = 0
@@ -84,7 +87,7 @@ class BatchCollector:
 
     def _with_records(self, rounds: TensorDictBase) -> Batch:
         env = self._env
-        batch = Batch(rounds, env.pop_episodes(), restarts=env.restarts)
+        batch = Batch(rounds, env.pop_episodes(), statistics=env.pop_statistics(), restarts=env.restarts)
         if env.restarts is None:
             return batch
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from rich.console import Console
 
 from mappo_unity.config.schema import Config
+from mappo_unity.envs.statistics import with_statistics
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
 from mappo_unity.runs.logger import RunLog
@@ -116,7 +117,7 @@ def _iterate(
             series = state.play_matches()
             saver.complete_matches()
         finally:  # a series that fails costs no row
-            log.log(row | series)
+            log.log(*with_statistics(row | series, batch.statistics))
         if series:
             log.message(state.matches.said)
 
