@@ -32,7 +32,7 @@ from mappo_unity.learning.minibatches import make_buffer
 from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
 from mappo_unity.learning.networks.encoders import RunningNorm
 from mappo_unity.learning.networks.poca import PocaCritic
-from mappo_unity.learning.optimizer import clip_gradients, in_two_groups, make_optimizer
+from mappo_unity.learning.optimizer import CriticWarmup, clip_gradients, in_two_groups, make_optimizer
 from mappo_unity.learning.rows import make_rows
 from mappo_unity.learning.value_norm import ValueNorm, move_statistics
 from mappo_unity.learning.value_reader import ValueReader, Values
@@ -51,6 +51,7 @@ class PolicyLearner:
         actor.keeps_components = cfg.ratio is RatioKind.component
         self.loss = MaskedClipPPOLoss(actor, critic, cfg)
         self.optimizer = make_optimizer(actor, critic, cfg)
+        self.warmup = CriticWarmup(cfg.critic_warmup_steps, actor)
         self.params = [*actor.parameters(), *critic.parameters()]
         self.value_norm = ValueNorm(cfg.value_norm_beta, cfg.normalize_values is not ValueNormKind.none)
         self.reader = ValueReader(critic, self.value_norm)
@@ -77,7 +78,7 @@ class PolicyLearner:
         Returns:
             Metrics.
         """
-        settings = self._set_schedules(progress)
+        settings = self._set_schedules(progress) | self.warmup.begin(batch)
         buffer, metrics = self.prepare(batch)
         metrics |= self.update(buffer) if buffer is not None else {}
         self._update_norms(batch)
@@ -210,7 +211,7 @@ class PolicyLearner:
         if self.cfg.value_norm_update is ValueNormUpdate.minibatch:
             self._normalize_values(minibatch)
         losses = self.loss(minibatch)
-        total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        total = self.warmup.total(losses)
 
         self.optimizer.zero_grad()
         total.backward()
@@ -257,7 +258,7 @@ class PolicyLearner:
         """Take the batch's observations into the normalisers, after the update that must not see it."""
         if self.norms:
             rows = batch.get(keys.OBS)[batch.get(keys.ACTING).squeeze(-1)]
-            for norm in self.norms:
+            for norm in self.warmup.moving(self.norms):
                 norm.update(rows)
 
     def _weights_finite(self) -> bool:
@@ -283,6 +284,7 @@ class PolicyLearner:
             "critic_states": self.reader.state_dict(),
             "updates": self.updates,
             "rollbacks": self.rollbacks,
+            "decisions": self.warmup.decisions,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -292,4 +294,5 @@ class PolicyLearner:
         self.carried.load_state_dict(state.get("carried"))
         self.reader.load_state_dict(state.get("critic_states", {}))
         self.rollbacks = int(state["rollbacks"])
+        self.warmup.decisions = int(state.get("decisions", 0))
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2
