@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mappo_unity.errors import ConfigError
+from mappo_unity.learning.networks.distributions import LEAST_SCALE
 from mappo_unity.policies.warm_start.graph import Linear, OnnxGraph
 
 CONTINUOUS, DISCRETE, SHAPE = "continuous_actions", "discrete_actions", "discrete_action_output_shape"
@@ -18,14 +19,15 @@ class Actions:
     """The layers that give actions.
 
     Attributes: `mean` of continuous actions; `log_std` ``[C]`` where it does not depend on what is seen,
-    `raw_std` the layer that gives our squashed actions' deviations; `squashed`, whether the mean goes
-    through tanh; `branches`, the logits of each, or of all combinations (`joint`); `branch_sizes`; `hidden`,
+    `raw_std` the layer that gives our squashed actions' deviations, and `init_log_std` what these were at
+    first; `squashed`, whether the mean goes through tanh; `branches`, the logits of each, or of all combinations (`joint`); `branch_sizes`; `hidden`,
     the name that all of them take.
     """
 
     mean: Linear | None
     log_std: np.ndarray | None
     raw_std: Linear | None
+    init_log_std: float | None
     squashed: bool
     branches: list[Linear]
     branch_sizes: list[int]
@@ -46,11 +48,13 @@ def read_actions(graph: OnnxGraph) -> Actions:
             f"{', '.join(graph.outputs) or 'none'}, none of {CONTINUOUS}, {DISCRETE}"
         )
 
-    mean = log_std = raw_std = None
+    mean = log_std = raw_std = init_log_std = None
     squashed, branches = False, []
     if CONTINUOUS in found:
         mean, squashed = _mean(graph)
-        log_std, raw_std = _deviation(graph, mean)
+        std = _deviation(graph, mean)
+        log_std = None if std is None else _log_std(graph, std, len(mean.bias))
+        raw_std, init_log_std = (None, None) if std is None else _softplus_layer(graph, std)
     if DISCRETE in found:
         branches = _layers_behind(graph, _best_output(graph, DISCRETE))
     if not (mean or branches):
@@ -64,7 +68,7 @@ def read_actions(graph: OnnxGraph) -> Actions:
         )
     sizes = _branch_sizes(graph, branches)
     joint = len(sizes) > 1 and [len(layer.bias) for layer in branches] == [math.prod(sizes)]
-    return Actions(mean, log_std, raw_std, squashed, branches, sizes, joint, inputs.pop())
+    return Actions(mean, log_std, raw_std, init_log_std, squashed, branches, sizes, joint, inputs.pop())
 
 
 def _best_output(graph: OnnxGraph, name: str) -> str:
@@ -93,8 +97,8 @@ def _mean(graph: OnnxGraph) -> tuple[Linear, bool]:
     return layers[0], any(graph.op(at) == "Tanh" for at in way)
 
 
-def _deviation(graph: OnnxGraph, mean: Linear) -> tuple[np.ndarray | None, Linear | None]:
-    """Return the logarithm of the deviations, or the layer that gives them (with a softplus, as ours)."""
+def _deviation(graph: OnnxGraph, mean: Linear) -> str | None:
+    """Return the name of the deviations: what noise is multiplied by."""
     names = {mean.output}
     for at in graph.behind(CONTINUOUS, lambda at: at in names):
         if graph.op(at) != "Mul":
@@ -102,8 +106,8 @@ def _deviation(graph: OnnxGraph, mean: Linear) -> tuple[np.ndarray | None, Linea
         first, second = graph.node(at).input
         for noise, std in ((first, second), (second, first)):
             if graph.op(noise) == "RandomNormalLike":
-                return _log_std(graph, std, len(mean.bias)), _softplus_layer(graph, std)
-    return None, None
+                return std
+    return None
 
 
 def _log_std(graph: OnnxGraph, std: str, size: int) -> np.ndarray | None:
@@ -123,12 +127,15 @@ def _log_std(graph: OnnxGraph, std: str, size: int) -> np.ndarray | None:
     return None if value is None else np.broadcast_to(value.reshape(-1), size).astype(np.float32)
 
 
-def _softplus_layer(graph: OnnxGraph, std: str) -> Linear | None:
+def _softplus_layer(graph: OnnxGraph, std: str) -> tuple[Linear | None, float | None]:
+    """Return the layer of ``softplus(raw + shift) + least``, and the initial log deviation; see `scale_shift`."""
     added = graph.with_constant(std, "Add")
     if added is None or graph.op(added[0]) != "Softplus":
-        return None
+        return None, None
     shifted = graph.with_constant(graph.node(added[0]).input[0], "Add")
-    return None if shifted is None else graph.linear(shifted[0])
+    if shifted is None:
+        return None, None
+    return graph.linear(shifted[0]), round(math.log(float(added[1]) / LEAST_SCALE), 5)
 
 
 def _branch_sizes(graph: OnnxGraph, branches: list[Linear]) -> list[int]:

@@ -62,6 +62,8 @@ class OnnxNetwork:
             out["normalize_obs"] = any(part.mean is not None for part in self.parts)
         if self.actions.mean is not None:
             out["action_distribution"] = "tanh_normal" if self.actions.squashed else "gaussian"
+        if self.actions.init_log_std is not None:
+            out["init_log_std"] = self.actions.init_log_std
         if len(self.actions.branch_sizes) > 1:
             out["flatten_branches"] = self.actions.joint
         return out

@@ -79,7 +79,7 @@ def _from_onnx(path: Path, learner: PolicyLearner, layout: Mapping[str, Any]) ->
     misfits: dict[str, str] = {}
     for prefix, member in (members or {"": net}).items():
         own, why = actor_tensors(network, member, layout["sensors"])
-        tensors |= {NETWORK + prefix + n: torch.from_numpy(values) for n, values in own.items()}
+        tensors |= {NETWORK + prefix + n: torch.tensor(values) for n, values in own.items()}
         misfits |= {NETWORK + prefix + n: reason for n, reason in why.items()}
 
     rows = copy_fitting(learner.actor, "actor", tensors, misfits)
