@@ -6,6 +6,7 @@ Legend (shape suffixes of tensors everywhere in the package):
     S  sides of one policy name  G  teams of a side
     A  agents of a team          O  features of the observation
     K  discrete branches         C  continuous actions
+    V  reward streams, each with a value of its own
 
 A policy name ("3DBall", "SoccerTwos") is the first key; below it stand the entries named here.
 An entry of a batch has shape ``[T, G, A, ...]`` for a policy with one side and ``[T, S, G, A, ...]``
@@ -29,9 +30,9 @@ GROUP_REWARD = "group_reward"  # float32 [..., A, 1]: reward of the agent's team
 DONE = "done"  # bool [..., A, 1]: terminated or truncated
 TERMINATED = "terminated"  # bool [..., A, 1]: a real end
 TRUNCATED = "truncated"  # bool [..., A, 1]: a time limit ("interrupted" in ML-Agents)
-VALUE = "state_value"  # float32 [..., A, 1]: in the critic's (normalised) space
+VALUE = "state_value"  # float32 [..., A, V]: in the critic's (normalised) space
 ADVANTAGE = "advantage"  # float32 [..., A, 1]
-VALUE_TARGET = "value_target"  # float32 [..., A, 1]: in the critic's (normalised) space
+VALUE_TARGET = "value_target"  # float32 [..., A, V]: in the critic's (normalised) space
 
 
 def policy_name(behavior_name: str) -> str:

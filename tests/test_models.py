@@ -67,14 +67,14 @@ def test_running_norm_matches_the_statistics_of_all_rows():
 
 def test_value_norm_is_debiased_and_inverts():
     norm = ValueNorm(beta=0.9)
-    returns = torch.randn(4000) * 3 + 50
+    returns = torch.randn(4000, 1) * 3 + 50
     norm.update(returns)
     mean, std = norm.statistics()
-    assert mean == pytest.approx(float(returns.mean()), rel=1e-5)
-    assert std == pytest.approx(float(returns.std(unbiased=False)), rel=1e-4)
+    assert float(mean) == pytest.approx(float(returns.mean()), rel=1e-5)
+    assert float(std) == pytest.approx(float(returns.std(unbiased=False)), rel=1e-4)
     assert torch.allclose(norm.denormalize(norm.normalize(returns)), returns, atol=1e-3)
     assert ValueNorm(0.9, enabled=False).normalize(returns) is not None
-    assert ValueNorm(0.9, enabled=False).statistics() == (0.0, 1.0)
+    assert ValueNorm(0.9, enabled=False).statistics() == (torch.zeros(1), torch.ones(1))
 
 
 def test_the_first_actions_are_near_the_middle_and_spread_by_init_log_std():

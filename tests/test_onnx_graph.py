@@ -8,7 +8,11 @@ import pytest
 import torch
 from onnx_fakes import data_of, inputs, make
 
-from mappo_unity.config.schema import Activation, DistributionKind
+from mappo_unity import keys
+from mappo_unity.config.schema import Activation, DistributionKind, MemoryKind, ModelConfig
+from mappo_unity.learning.networks.actor_critic import make_actor
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.policies.onnx_check import compare
 from mappo_unity.policies.onnx_graph import ExportError, build_model
 from mappo_unity.policies.onnx_policy import open_session
@@ -99,6 +103,17 @@ CASES = {
 def test_a_model_plays_as_its_actor(name):
     sensors, continuous, branches, options = CASES[name]
     actor, sample = make(sensors, continuous, branches, **options), inputs(sensors, branches)
+    assert compare(data_of(actor, sensors), actor, sensors, sample) <= 1e-5
+
+
+def test_cells_of_an_lstm_that_grew_large_are_compared_by_their_digits():
+    torch.manual_seed(0)
+    sensors, sample = [[6]], inputs([[6]], [3])
+    cfg = ModelConfig(hidden=[32], memory=MemoryKind.lstm, memory_size=16)
+    actor = make_actor(ObsLayout(6), ActionLayout(0, (3,)), 1, cfg)
+    # of cells like these float32 has steps of 1e-3
+    hidden, cells = torch.randn(2, len(sample[keys.OBS]), 8).split(1)
+    sample[keys.MEMORY] = torch.cat([hidden.tanh(), cells * 1e4], -1).squeeze(0)
     assert compare(data_of(actor, sensors), actor, sensors, sample) <= 1e-5
 
 

@@ -190,9 +190,9 @@ def test_popart_moves_the_statistics_and_leaves_the_values(kind, hidden, share):
     learner = make_learner(model=model, normalize_values=ValueNormKind.popart)
     assert len(learner.value_layers) == (1 if share else A)
     batch = make_batch(learner)
-    move_statistics(learner.value_norm, torch.randn(100) * 5 + 30, learner.value_layers)
+    move_statistics(learner.value_norm, torch.randn(100, 1) * 5 + 30, learner.value_layers)
     before = learner.reader.values_of(batch)
-    move_statistics(learner.value_norm, torch.randn(100) * 50 - 300, learner.value_layers)
+    move_statistics(learner.value_norm, torch.randn(100, 1) * 50 - 300, learner.value_layers)
     after = learner.reader.values_of(batch)
     assert learner.value_norm.statistics()[0] < -100
     assert torch.allclose(before, after, rtol=1e-4, atol=1e-2)

@@ -311,9 +311,7 @@ def test_the_actor_learns_once_the_critic_is_warm(run: Path, tmp_path: Path) -> 
     assert [row["critic_warmup"] for row in read_rows(tmp_path)] == ["1.0", "0.0"]
     first, last = (checkpoint.load(path) for path in sorted(tmp_path.rglob("step_*.pt")))
     key = "module.0.module.net.0.weight"
-    assert not torch.equal(
-        first["learners"]["Probe"]["actor"][key], last["learners"]["Probe"]["actor"][key]
-    )
+    assert not torch.equal(first["learners"]["Probe"]["actor"][key], last["learners"]["Probe"]["actor"][key])
 
     # the counter outlives a resume
     assert train_main([f"resume={run_of(tmp_path)}", "max_steps=384"]) == 0
@@ -422,7 +420,10 @@ def strange_model(path: Path, op: str) -> None:
         (["init_from=broken.onnx"], "broken.onnx is no ONNX model"),
         (["init_from=strange.onnx"], "strange.onnx: the means of its continuous actions come from 0 layers"),
         (["init_from=own.onnx", "model.hidden=[7]"], "model.hidden=[7] contradicts own.onnx"),
-        (["init_from=own.onnx", "behaviors.Probe.model.hidden=[7]"], "behaviors.Probe.model.hidden=[7] contra"),
+        (
+            ["init_from=own.onnx", "behaviors.Probe.model.hidden=[7]"],
+            "behaviors.Probe.model.hidden=[7] contra",
+        ),
         (["init_from=other.onnx"], "nothing of it fits the networks of Probe"),
         (["behaviors.Probe.init_from=5"], "behaviors.Probe.init_from=5 must name"),
         (["behaviors.Probe.train=maybe"], "behaviors.Probe.train='maybe' must be true or false"),

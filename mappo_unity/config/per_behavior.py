@@ -1,4 +1,4 @@
-"""Options of one behavior name: the sections ppo and model, with its own overrides on top.
+"""Options of one behavior name: the sections of its learner, with its own overrides on top.
 
 Beside them stand `init_from`, what its networks begin with, and `train`, whether they learn.
 """
@@ -8,16 +8,23 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from dataclasses import fields
-from typing import Any
+from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mappo_unity.config.schema import Config, ModelConfig, PPOConfig
+from mappo_unity.config.schema import Config, ModelConfig, PPOConfig, RewardsConfig
 from mappo_unity.errors import ConfigError
 
-SECTIONS = ("model", "ppo")
 INIT_FROM, TRAIN = "init_from", "train"
+
+
+class BehaviorConfig(NamedTuple):
+    """The sections that can differ by behavior."""
+
+    model: ModelConfig
+    ppo: PPOConfig
+    rewards: RewardsConfig
 
 
 def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:
@@ -36,8 +43,8 @@ def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:
         behavior_config(cfg, name)
 
 
-def behavior_config(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
-    """Return the model and learner options of a policy name.
+def behavior_config(cfg: Config, policy: str) -> BehaviorConfig:
+    """Return the options of a policy name.
 
     Raises:
         ConfigError: an override names no option, or its value has the wrong type or range.
@@ -49,10 +56,11 @@ def behavior_config(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
     if not isinstance(own, dict):
         raise ConfigError(f"{where}={own!r} must hold sections, for example {where}.ppo.lr=1e-4")
 
+    sections = BehaviorConfig._fields
     for section in own:
-        if section not in (*SECTIONS, INIT_FROM, TRAIN):
+        if section not in (*sections, INIT_FROM, TRAIN):
             raise ConfigError(
-                f"{where}.{section}: only the sections {' and '.join(SECTIONS)}, {INIT_FROM} and {TRAIN} can "
+                f"{where}.{section}: only the sections {', '.join(sections)}, {INIT_FROM} and {TRAIN} can "
                 "differ by behavior"
             )
     if not isinstance(own.get(INIT_FROM), (str, type(None))) or own.get(INIT_FROM) == "":
@@ -63,9 +71,7 @@ def behavior_config(cfg: Config, policy: str) -> tuple[ModelConfig, PPOConfig]:
     if not isinstance(own.get(TRAIN, True), bool):
         raise ConfigError(f"{where}.{TRAIN}={own[TRAIN]!r} must be true or false")
 
-    model = _merged(cfg.model, own.get("model"), f"{where}.model")
-    ppo = _merged(cfg.ppo, own.get("ppo"), f"{where}.ppo")
-    return model, ppo
+    return BehaviorConfig(*(_merged(getattr(cfg, s), own.get(s), f"{where}.{s}") for s in sections))
 
 
 def init_source(cfg: Config, policy: str) -> tuple[str, str | None]:

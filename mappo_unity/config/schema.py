@@ -290,16 +290,8 @@ class ModelConfig:
     tanh_normal before tanh), from -5 to 2, where training keeps it."""
 
     def __post_init__(self) -> None:
-        # null and [] mean model.hidden, which is checked itself
-        for option, widths in (
-            ("model.hidden", self.hidden),
-            ("model.critic_hidden", self.critic_hidden or [1]),
-        ):
-            if not widths or any(width < 1 for width in widths):
-                raise ConfigError(
-                    f"{option}={list(widths)} must be a list of at least one width, each >= 1, "
-                    f"for example {option}=[128,128]"
-                )
+        _check_widths("model.hidden", self.hidden)
+        _check_widths("model.critic_hidden", self.critic_hidden or [1])  # null and [] mean model.hidden
 
         _at_least("model.memory_size", self.memory_size, 1)
         if self.memory is MemoryKind.lstm and self.memory_size % 2:
@@ -437,6 +429,77 @@ class PPOConfig:
 
 
 @dataclass
+class ExtrinsicConfig:
+    """The environment's own rewards, individual and group reward."""
+
+    strength: float = 1.0
+    """Factor of the environment's rewards; 0 learns from the other streams alone."""
+    gamma: Optional[float] = None
+    """Discount of the environment's rewards; null: as ppo.gamma."""
+
+    def __post_init__(self) -> None:
+        _at_least("rewards.extrinsic.strength", self.strength, 0)
+        if self.gamma is not None:
+            _within("rewards.extrinsic.gamma", self.gamma, 0, 1)
+
+
+@dataclass
+class CuriosityConfig:
+    """Reward for what a model of the environment does not foresee (ICM, arXiv 1705.05363)."""
+
+    strength: float = 0.0
+    """Factor of the reward; 0: this stream is off."""
+    gamma: float = 0.99
+    """Discount of the reward."""
+    lr: float = 3e-4
+    """Learning rate of the model."""
+    hidden: list[int] = field(default_factory=lambda: [128, 128])
+    """Widths of the layers that turn observations into features."""
+    normalize: bool = True
+    """Divide the reward by the running deviation of its discounted sums; false: as it is (ML-Agents)."""
+
+    def __post_init__(self) -> None:
+        _check_intrinsic("rewards.curiosity", self)
+
+
+@dataclass
+class RNDConfig:
+    """Reward for observations that are new (random network distillation, arXiv 1810.12894)."""
+
+    strength: float = 0.0
+    """Factor of the reward; 0: this stream is off."""
+    gamma: float = 0.99
+    """Discount of the reward."""
+    lr: float = 1e-4
+    """Learning rate of the predictor."""
+    hidden: list[int] = field(default_factory=lambda: [128, 128])
+    """Widths of the layers of predictor and target."""
+    normalize: bool = True
+    """Divide the reward by the running deviation of its discounted sums; false: as it is (ML-Agents)."""
+
+    def __post_init__(self) -> None:
+        _check_intrinsic("rewards.rnd", self)
+
+
+@dataclass
+class RewardsConfig:
+    """Streams of rewards, each with a discount and a value of its own; their advantages are summed."""
+
+    extrinsic: ExtrinsicConfig = field(default_factory=ExtrinsicConfig)
+    """The environment's own rewards."""
+    curiosity: CuriosityConfig = field(default_factory=CuriosityConfig)
+    """Reward for what a model of the environment does not foresee."""
+    rnd: RNDConfig = field(default_factory=RNDConfig)
+    """Reward for observations that are new."""
+
+    @property
+    def intrinsic(self) -> dict[str, Any]:
+        """The streams beside the environment's that are on, by name."""
+        streams = {"curiosity": self.curiosity, "rnd": self.rnd}
+        return {name: stream for name, stream in streams.items() if stream.strength > 0}
+
+
+@dataclass
 class CollectConfig:
     """Collecting experience."""
 
@@ -495,6 +558,8 @@ class Config:
     """The actor's and the critic's networks."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """The learner."""
+    rewards: RewardsConfig = field(default_factory=RewardsConfig)
+    """Streams of rewards beside the environment's own."""
     collect: CollectConfig = field(default_factory=CollectConfig)
     """Collecting experience."""
     matches: MatchConfig = field(default_factory=MatchConfig)
@@ -503,7 +568,7 @@ class Config:
     """Metrics and progress."""
     behaviors: dict[str, Any] = field(default_factory=dict)
     """Options of one behavior name: behaviors.Goalie.ppo.lr=1e-4 overrides ppo.lr for Goalie; sections
-    ppo and model, init_from, and train=false for one that only plays."""
+    ppo, model and rewards, init_from, and train=false for one that only plays."""
     seed: int = 0
     """Seed of the environment, the networks and the sampling."""
     max_steps: int = 1_000_000
@@ -631,6 +696,21 @@ def _not_empty(**options: Optional[str]) -> None:
     for name, value in options.items():
         if value == "":
             raise ConfigError(f"{name}= is empty: give it a value, or leave it out")
+
+
+def _check_intrinsic(section: str, cfg: CuriosityConfig | RNDConfig) -> None:
+    _at_least(f"{section}.strength", cfg.strength, 0)
+    _within(f"{section}.gamma", cfg.gamma, 0, 1)
+    _above(f"{section}.lr", cfg.lr, 0)
+    _check_widths(f"{section}.hidden", cfg.hidden)
+
+
+def _check_widths(option: str, widths: list[int]) -> None:
+    if not widths or any(width < 1 for width in widths):
+        raise ConfigError(
+            f"{option}={list(widths)} must be a list of at least one width, each >= 1, "
+            f"for example {option}=[128,128]"
+        )
 
 
 def _rule(option: str, value: float | None, holds: bool, rule: str) -> None:

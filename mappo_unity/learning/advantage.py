@@ -19,6 +19,7 @@ the rows before it bootstrap from its value. With a value in every round this is
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,11 +31,11 @@ from mappo_unity.learning.decisions import DecisionView
 
 
 class Advantage(NamedTuple):
-    """Result of `estimate`; every tensor is ``[T, ...]``."""
+    """Result of `estimate` and `estimate_streams`."""
 
-    advantage: Tensor  # float32, 0 where not known
-    target: Tensor  # float32, value targets (advantage + value), 0 where not known
-    known: Tensor  # bool: rows with a decision whose outcome has arrived
+    advantage: Tensor  # float32 as the values, 0 where not known
+    target: Tensor  # float32 as the values, value targets (advantage + value), 0 where not known
+    known: Tensor  # bool [T, ...]: rows with a decision whose outcome has arrived
 
 
 def make_view(valued_T: Tensor, final_valued: Tensor, ended_T: Tensor) -> DecisionView:
@@ -75,6 +76,35 @@ def estimate(
     return Advantage(back(advantage), back(target), back(view.known))
 
 
+def estimate_streams(
+    view: DecisionView,
+    reward_T: Tensor,
+    value_T: Tensor,
+    end_value_T: Tensor,
+    final_value: Tensor,
+    truncated_T: Tensor,
+    *,
+    gammas: Sequence[float],
+    gae_lambda: float,
+) -> Advantage:
+    """Estimate advantages and targets ``[T, ..., S]`` of V reward streams, each as in `estimate`.
+
+    Args:
+        view: see `estimate`; so are the others, with a last dimension V.
+        truncated_T: bool ``[T, ..., 1]``.
+        gammas: the discount of each stream.
+    """
+    columns = zip(*(x.split(1, -1) for x in (reward_T, value_T, end_value_T, final_value)))
+    parts = [
+        estimate(view, *column, truncated_T, gamma=gamma, gae_lambda=gae_lambda)
+        for column, gamma in zip(columns, gammas, strict=True)
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    advantage, target = (torch.cat([part[i] for part in parts], -1) for i in range(2))
+    return Advantage(advantage, target, parts[0].known)
+
+
 def _flat(values: Tensor) -> np.ndarray:
     """Return ``[T, ...]`` as an array ``[T, N]``."""
     return values.cpu().numpy().reshape(len(values), -1)
@@ -106,6 +136,31 @@ def explained_variance(value: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     error_var = masked_mean((error - masked_mean(error, mask)) ** 2, mask)
     target_var = masked_mean((target - masked_mean(target, mask)) ** 2, mask)
     return torch.where(target_var > 0, 1 - error_var / target_var, torch.nan)
+
+
+def value_metrics(names: Sequence[str], value: Tensor, target: Tensor, mask: Tensor) -> dict[str, float]:
+    """Return how well values ``[..., V]`` explain their targets, and their means.
+
+    Args:
+        names: of the streams; the first one's metrics have no prefix.
+        mask: bool ``[..., 1]``, rows that count.
+    """
+    metrics = {}
+    for number, name in enumerate(names):
+        prefix = f"{name}_" if number else ""
+        column, wanted = value[..., number : number + 1], target[..., number : number + 1]
+        metrics[f"{prefix}explained_variance"] = float(explained_variance(column, wanted, mask))
+        metrics[f"{prefix}value_mean"] = float(masked_mean(column, mask))
+    return metrics
+
+
+def approximate_kl(log_ratio: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the approximate KL of log-ratios ``[..., n]`` of an action's n components, a scalar.
+
+    k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative.
+    """
+    joint = log_ratio.sum(-1, keepdim=True)
+    return masked_mean(joint.exp() - 1 - joint, mask)
 
 
 def scheduled(schedule: Schedule, start: float, final: float, progress: float) -> float:

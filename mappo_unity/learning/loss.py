@@ -131,10 +131,11 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         return critic.value(*inputs), critic.baseline(*inputs, rows.get(keys.ACTION))
 
     def _distance(self, value: Tensor, target: Tensor, old: Tensor | None, clip: float) -> Tensor:
+        """Return distances ``[..., 1]`` of values ``[..., V]``: the mean over reward streams (ML-Agents)."""
         loss = self._unclipped(value, target)
-        if old is None:
-            return loss
-        return torch.max(loss, self._unclipped(old + (value - old).clamp(-clip, clip), target))
+        if old is not None:
+            loss = torch.max(loss, self._unclipped(old + (value - old).clamp(-clip, clip), target))
+        return loss if loss.shape[-1] == 1 else loss.mean(-1, keepdim=True)
 
     def _unclipped(self, value: Tensor, target: Tensor) -> Tensor:
         if self.cfg.value_loss is ValueLoss.huber:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from mappo_unity import keys
 from mappo_unity.config.schema import Optimizer, PPOConfig
+from mappo_unity.learning.advantage import scheduled
 
 
 def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch.optim.Optimizer:
@@ -22,6 +23,17 @@ def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch
     kind = torch.optim.AdamW if cfg.optimizer is Optimizer.adamw else torch.optim.Adam
     groups = [{"params": list(net.parameters())} for net in (actor, critic)]
     return kind(groups, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=1e-5, fused=True)
+
+
+def set_learning_rates(optimizer: torch.optim.Optimizer, cfg: PPOConfig, progress: float) -> float:
+    """Set the rates of both groups after a share of the run, 0 to 1; return the actor's."""
+    lr = scheduled(cfg.lr_schedule, cfg.lr, cfg.lr_final, progress)
+    start = cfg.lr if cfg.critic_lr is None else cfg.critic_lr
+    critic_lr = scheduled(cfg.lr_schedule, start, cfg.lr_final, progress)
+
+    for group, rate in zip(optimizer.param_groups, (lr, critic_lr)):
+        group["lr"] = rate
+    return lr
 
 
 def in_two_groups(state: dict[str, Any], actor_size: int) -> dict[str, Any]:

@@ -19,12 +19,13 @@ from mappo_unity import keys
 from mappo_unity.config.schema import PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
 from mappo_unity.learning.advantage import (
     Advantage,
-    estimate,
-    explained_variance,
+    approximate_kl,
+    estimate_streams,
     make_view,
     masked_mean,
     normalize,
     scheduled,
+    value_metrics,
 )
 from mappo_unity.learning.carried import VALUED, CarriedRounds, has_value
 from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS, MaskedClipPPOLoss
@@ -32,9 +33,16 @@ from mappo_unity.learning.minibatches import make_buffer
 from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
 from mappo_unity.learning.networks.encoders import RunningNorm
 from mappo_unity.learning.networks.poca import PocaCritic
-from mappo_unity.learning.optimizer import CriticWarmup, clip_gradients, in_two_groups, make_optimizer
+from mappo_unity.learning.optimizer import (
+    CriticWarmup,
+    clip_gradients,
+    in_two_groups,
+    make_optimizer,
+    set_learning_rates,
+)
+from mappo_unity.learning.rewards.streams import RewardStreams
 from mappo_unity.learning.rows import make_rows
-from mappo_unity.learning.value_norm import ValueNorm, move_statistics
+from mappo_unity.learning.value_norm import ValueNorm, by_stream, move_statistics
 from mappo_unity.learning.value_reader import ValueReader, Values
 
 
@@ -44,16 +52,25 @@ class PolicyLearner:
     Args:
         actor, critic: see `learning.networks.actor_critic`; both have a memory, or neither.
         cfg: the learner's options.
+        rewards: the streams that the critic has values for; None: the environment's rewards alone.
     """
 
-    def __init__(self, actor: UnityActor, critic: TensorDictModule, cfg: PPOConfig) -> None:
+    def __init__(
+        self,
+        actor: UnityActor,
+        critic: TensorDictModule,
+        cfg: PPOConfig,
+        rewards: RewardStreams | None = None,
+    ) -> None:
         self.actor, self.critic, self.cfg = actor, critic, cfg
+        self.rewards = rewards or RewardStreams(cfg)
         actor.keeps_components = cfg.ratio is RatioKind.component
         self.loss = MaskedClipPPOLoss(actor, critic, cfg)
         self.optimizer = make_optimizer(actor, critic, cfg)
         self.warmup = CriticWarmup(cfg.critic_warmup_steps, actor)
         self.params = [*actor.parameters(), *critic.parameters()]
-        self.value_norm = ValueNorm(cfg.value_norm_beta, cfg.normalize_values is not ValueNormKind.none)
+        is_normalized = cfg.normalize_values is not ValueNormKind.none
+        self.value_norm = ValueNorm(cfg.value_norm_beta, is_normalized, len(self.rewards.names))
         self.reader = ValueReader(critic, self.value_norm)
 
         inputs = [str(key) for net in (actor, critic) for key in net.in_keys]
@@ -81,20 +98,15 @@ class PolicyLearner:
         settings = self._set_schedules(progress) | self.warmup.begin(batch)
         buffer, metrics = self.prepare(batch)
         metrics |= self.update(buffer) if buffer is not None else {}
+        metrics |= self.rewards.learn()
         self._update_norms(batch)
         return metrics | settings
 
     def _set_schedules(self, progress: float) -> dict[str, float]:
         cfg = self.cfg
-        lr = scheduled(cfg.lr_schedule, cfg.lr, cfg.lr_final, progress)
+        lr = set_learning_rates(self.optimizer, cfg, progress)
         clip = scheduled(cfg.clip_schedule, cfg.clip_epsilon, cfg.clip_epsilon_final, progress)
         entropy = scheduled(cfg.entropy_schedule, cfg.entropy_coef, cfg.entropy_coef_final, progress)
-
-        # the actor's parameters, then the critic's
-        start = cfg.lr if cfg.critic_lr is None else cfg.critic_lr
-        critic_lr = scheduled(cfg.lr_schedule, start, cfg.lr_final, progress)
-        for group, rate in zip(self.optimizer.param_groups, (lr, critic_lr)):
-            group["lr"] = rate
         self.loss.clip_epsilon.fill_(clip)
         self.loss.entropy_coeff.fill_(entropy)
 
@@ -109,32 +121,25 @@ class PolicyLearner:
 
         ended = rounds.get(keys.TERMINATED) | rounds.get(keys.TRUNCATED)
         view = make_view(rounds.get(VALUED), has_value(following[-1]), ended)
-        gae = estimate(
+        rewards, metrics = self.rewards.rewards(rounds, following, view)
+        gae = estimate_streams(
             view,
-            self._rewards(rounds),
+            rewards,
             values.value,
             values.end,
             values.final,
             rounds.get(keys.TRUNCATED),
-            gamma=self.cfg.gamma,
+            gammas=self.rewards.gammas,
             gae_lambda=self.cfg.gae_lambda,
         )
         self.carried.keep(rounds, view)
         self.reader.keep(values, rounds.get(VALUED) & ~gae.known)
 
         learns = gae.known & rounds.get(keys.ACTING)
-        metrics = {
-            "explained_variance": float(explained_variance(values.value, gae.target, learns)),
-            "value_mean": float(masked_mean(values.value, learns)),
-        }
+        metrics |= value_metrics(self.rewards.names, values.value, gae.target, learns)
         self._enter(rounds, values, gae, learns)
         rows, decisions = self.rows.of(rounds, view)
         return (make_buffer(rows, decisions, self.cfg) if len(rows) else None), metrics
-
-    def _rewards(self, rounds: TensorDict) -> Tensor:
-        """Return the weighted rewards of each round."""
-        own = self.cfg.reward_weight * rounds.get(keys.REWARD)
-        return own + self.cfg.group_reward_weight * rounds.get(keys.GROUP_REWARD)
 
     def _enter(self, rounds: TensorDict, values: Values, gae: Advantage, learns: Tensor) -> None:
         """Set the entries that the loss reads beside inputs and actions."""
@@ -143,13 +148,15 @@ class PolicyLearner:
         if not by_minibatch:
             move_statistics(
                 self.value_norm,
-                gae.target[gae.known],
+                gae.target[gae.known.squeeze(-1)],
                 self.value_layers if self.cfg.normalize_values is ValueNormKind.popart else (),
             )
 
         advantage = gae.advantage
         if values.baseline is not None:
             advantage = torch.where(gae.known, gae.target - values.baseline, 0.0)
+        if len(self.rewards.names) > 1:
+            advantage = advantage.sum(-1, keepdim=True)
         if self.cfg.normalize_advantages:
             advantage = normalize(advantage, learns)
 
@@ -227,28 +234,22 @@ class PolicyLearner:
                 "policy_loss": losses["loss_objective"].detach(),
                 "value_loss": losses["loss_critic"].detach(),
                 "entropy": masked_mean(self.loss.entropy, mask),
-                "kl": self._kl(mask),
+                "kl": approximate_kl(log_ratio, mask),
                 "clip_fraction": masked_mean(clipped.mean(-1, keepdim=True), mask),
                 "grad_norm": grad_norm.detach(),
             }
-
-    def _kl(self, mask: Tensor | None) -> Tensor:
-        """Return the approximate KL of the last call of the loss."""
-        log_ratio = self.loss.log_ratio.sum(-1, keepdim=True)
-        # k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative
-        return masked_mean(log_ratio.exp() - 1 - log_ratio, mask)
 
     @torch.no_grad()
     def _kl_after(self, minibatch: TensorDictBase) -> Tensor:
         """Return the approximate KL on the last minibatch, now that its step is taken."""
         self.loss.compare(minibatch)
-        return self._kl(minibatch.get(ACTOR_LEARNS, None))
+        return approximate_kl(self.loss.log_ratio, minibatch.get(ACTOR_LEARNS, None))
 
     @torch.no_grad()
     def _normalize_values(self, minibatch: TensorDictBase) -> None:
         """Take a minibatch's targets into the statistics and normalise its values by them."""
         targets, learns = minibatch.get(keys.VALUE_TARGET), minibatch.get(CRITIC_LEARNS, None)
-        self.value_norm.update(targets if learns is None else targets[learns])
+        self.value_norm.update(targets.flatten(0, -2) if learns is None else targets[learns.squeeze(-1)])
         for key in (keys.VALUE_TARGET, keys.VALUE, BASELINE):
             if key in minibatch.keys():
                 minibatch.set(key, self.value_norm.normalize(minibatch.get(key)))
@@ -282,6 +283,7 @@ class PolicyLearner:
             "value_norm": self.value_norm.state_dict(),
             "carried": self.carried.state_dict(),
             "critic_states": self.reader.state_dict(),
+            "rewards": self.rewards.state_dict(),
             "updates": self.updates,
             "rollbacks": self.rollbacks,
             "decisions": self.warmup.decisions,
@@ -290,9 +292,9 @@ class PolicyLearner:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from what `state_dict` returned."""
         self._load_trainable(state)
-        self.value_norm.load_state_dict(state["value_norm"])
+        self.value_norm.load_state_dict(by_stream(state["value_norm"]))
+        self.rewards.load_state_dict(state.get("rewards", {}))
         self.carried.load_state_dict(state.get("carried"))
         self.reader.load_state_dict(state.get("critic_states", {}))
-        self.rollbacks = int(state["rollbacks"])
-        self.warmup.decisions = int(state.get("decisions", 0))
+        self.rollbacks, self.warmup.decisions = int(state["rollbacks"]), int(state.get("decisions", 0))
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2

@@ -16,58 +16,67 @@ VARIANCE_FLOOR = 1e-2
 
 
 class ValueNorm(nn.Module):
-    """Normalise returns by debiased exponential averages.
+    """Normalise returns by debiased exponential averages, those of each reward stream by themselves.
 
     Args:
         beta: decay of the averages for each update.
         enabled: False makes it the identity.
+        streams: V, reward streams that have a value each.
     """
 
     mean: Tensor
     mean_sq: Tensor
     debias: Tensor
 
-    def __init__(self, beta: float, enabled: bool = True) -> None:
+    def __init__(self, beta: float, enabled: bool = True, streams: int = 1) -> None:
         super().__init__()
         self.beta, self.enabled = beta, enabled
-        self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("mean_sq", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(streams, dtype=torch.float64))
+        self.register_buffer("mean_sq", torch.zeros(streams, dtype=torch.float64))
         self.register_buffer("debias", torch.zeros((), dtype=torch.float64))
 
     @torch.no_grad()
     def update(self, returns: Tensor) -> None:
-        """Take returns ``[n]`` into the averages."""
+        """Take returns ``[n, V]`` into the averages."""
         if not self.enabled or not returns.numel():
             return
 
         # in float64: a difference of two averages of squares loses digits
-        returns = returns.double()
-        self.mean.mul_(self.beta).add_(float(returns.mean()) * (1 - self.beta))
-        self.mean_sq.mul_(self.beta).add_(float((returns**2).mean()) * (1 - self.beta))
+        columns = [column.contiguous() for column in returns.double().unbind(-1)]
+        for average, moments in (
+            (self.mean, [column.mean() for column in columns]),
+            (self.mean_sq, [(column**2).mean() for column in columns]),
+        ):
+            average.mul_(self.beta).add_(torch.stack(moments).to(average) * (1 - self.beta))
         self.debias.mul_(self.beta).add_(1 - self.beta)
 
-    def statistics(self) -> tuple[float, float]:
-        """Return the debiased mean and standard deviation of returns."""
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        """Return the debiased means and standard deviations of returns, float64 ``[V]``."""
         if not self.enabled or float(self.debias) == 0.0:
-            return 0.0, 1.0
-        mean = float(self.mean / self.debias)
-        variance = float(self.mean_sq / self.debias) - mean**2
-        return mean, max(variance, VARIANCE_FLOOR) ** 0.5
+            return torch.zeros_like(self.mean), torch.ones_like(self.mean)
+        mean = self.mean / self.debias
+        variance = self.mean_sq / self.debias - mean**2
+        return mean, variance.clamp_min(VARIANCE_FLOOR).sqrt()
 
     def normalize(self, returns: Tensor) -> Tensor:
-        """Return ``(returns - mean) / std``."""
-        mean, std = self.statistics()
+        """Return ``(returns - mean) / std`` of returns ``[..., V]``."""
+        mean, std = (moment.to(returns) for moment in self.statistics())
         return (returns - mean) / std
 
     def denormalize(self, values: Tensor) -> Tensor:
-        """Return ``values * std + mean``, the critic's output in the reward's scale."""
-        mean, std = self.statistics()
+        """Return ``values * std + mean``, the critic's outputs ``[..., V]`` in the rewards' scale."""
+        mean, std = (moment.to(values) for moment in self.statistics())
         return values * std + mean
+
+
+def by_stream(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the state of a `ValueNorm`; one from before 0.3 has a number for each moment, and no streams."""
+    return {name: value if name == "debias" else value.reshape(-1) for name, value in state.items()}
 
 
 @torch.no_grad()
 def move_statistics(norm: ValueNorm, returns: Tensor, layers: Sequence[nn.Linear] = ()) -> None:
-    """Take returns ``[n]`` into the statistics; what these layers say, in the reward's scale, stays.
+    """Take returns ``[n, V]`` into the statistics; what these layers say, in the rewards' scale, stays.
 
     PopArt (van Hasselt et al., arXiv 1602.07714, eq. 7): w' = w std / std',
     b' = (std b + mean - mean') / std'.
@@ -76,5 +85,6 @@ def move_statistics(norm: ValueNorm, returns: Tensor, layers: Sequence[nn.Linear
     norm.update(returns)
     new_mean, new_std = norm.statistics()
     for layer in layers:
-        layer.weight.mul_(std / new_std)
-        layer.bias.mul_(std).add_(mean - new_mean).div_(new_std)
+        weight, bias = layer.weight, layer.bias
+        weight.mul_((std / new_std).unsqueeze(-1).to(weight))
+        bias.mul_(std.to(bias)).add_((mean - new_mean).to(bias)).div_(new_std.to(bias))

@@ -190,4 +190,4 @@ class RunState:
         return without_channels(layout) if self.setup.guesses_channels else layout
 
     def _models(self) -> dict[str, Any]:
-        return describe_models({name: behavior_config(self.cfg, name)[0] for name in self.setup.learners})
+        return describe_models({name: behavior_config(self.cfg, name).model for name in self.setup.learners})

@@ -18,7 +18,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType
 
 from mappo_unity.config.per_behavior import TRAIN, behavior_config, check_behaviors, is_frozen
-from mappo_unity.config.schema import CollectConfig, Config, ModelConfig, PPOConfig
+from mappo_unity.config.schema import CollectConfig, Config, CriticKind, ModelConfig, PPOConfig
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.envs.transforms import transformed
 from mappo_unity.envs.unity_env import UnityEnv
@@ -27,6 +27,7 @@ from mappo_unity.learning.networks.actor_critic import JointPolicy, make_actor, 
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.ppo import PolicyLearner
+from mappo_unity.learning.rewards.streams import RewardStreams, make_intrinsic
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
@@ -204,7 +205,7 @@ def make_learners(
 
     learners = {}
     for name, sides in env.sides.items():
-        model, ppo = behavior_config(cfg, name)
+        model, ppo, rewards = behavior_config(cfg, name)
         behavior = env.behaviors[sides[0]]
         # sides that share a policy are stacked: all their teams are rows of its batch
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
@@ -220,8 +221,11 @@ def make_learners(
 
         # Built after the check, so that what does not fit is refused by a line of ours.
         actor = make_actor(obs, layout, team_size, model).to(cfg.device)
-        critic = make_critic(obs, team_size, model, layout).to(cfg.device)
-        learners[name] = PolicyLearner(actor, critic, ppo)
+        intrinsic = make_intrinsic(obs, layout, rewards, cfg.device)
+        critic = make_critic(obs, team_size, model, layout, 1 + len(intrinsic)).to(cfg.device)
+        shares = model.critic is CriticKind.poca and team_size > 1
+        streams = RewardStreams(ppo, rewards, intrinsic, obs.keys, shares)
+        learners[name] = PolicyLearner(actor, critic, ppo, streams)
 
     return learners
 

@@ -182,7 +182,9 @@ def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelC
     return UnityActor(net, obs.keys, layout)
 
 
-def make_critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: ActionLayout) -> TensorDictModule:
+def make_critic(
+    obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: ActionLayout, streams: int = 1
+) -> TensorDictModule:
     """Build the critic over the entries of one policy name; a team of one has a local one.
 
     Args:
@@ -190,33 +192,36 @@ def make_critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: Action
         team_size: slots of a team.
         cfg: the networks' options.
         layout: the sizes of an action, which MA-POCA's baseline reads.
+        streams: reward streams V, which have a value each.
     """
     local = team_size == 1 or cfg.critic is CriticKind.local
     in_keys = list(obs.keys) if local else [*obs.keys, keys.PRESENT, keys.DEPARTED]
 
     if cfg.share_parameters or team_size == 1:
-        net = _critic(obs, team_size, cfg, layout)
+        net = _critic(obs, team_size, cfg, layout, streams)
         if cfg.memory is not MemoryKind.none:
             net = RecurrentCritic(net, cfg, sees_team=not local)
             init_head(net.value_heads[0], cfg)
     else:
-        nets = [_critic(obs, team_size, cfg, layout) for _ in range(team_size)]
+        nets = [_critic(obs, team_size, cfg, layout, streams) for _ in range(team_size)]
         net = PerMember(nets, obs.team_dims if local else None)
 
     return TensorDictModule(net, in_keys=in_keys, out_keys=[keys.VALUE])
 
 
-def _critic(obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: ActionLayout) -> nn.Module:
+def _critic(
+    obs: ObsLayout, team_size: int, cfg: ModelConfig, layout: ActionLayout, streams: int
+) -> nn.Module:
     if team_size == 1 or cfg.critic is CriticKind.local:
-        net: nn.Module = LocalCritic(obs, cfg)
+        net: nn.Module = LocalCritic(obs, cfg, streams)
     elif cfg.critic is CriticKind.central:
-        net = CentralCritic(obs, team_size, cfg)
+        net = CentralCritic(obs, team_size, cfg, streams)
     elif cfg.critic is not CriticKind.poca:
-        net = PooledCritic(obs, team_size, cfg)
+        net = PooledCritic(obs, team_size, cfg, streams)
     else:
         has_memory = cfg.memory is not MemoryKind.none
         head_size = output_size(cfg.memory, cfg.memory_size) if has_memory else None
-        net = PocaCritic(obs, layout, team_size, cfg, head_size)
+        net = PocaCritic(obs, layout, team_size, cfg, head_size, streams)
     return apply_options(net, cfg)
 
 

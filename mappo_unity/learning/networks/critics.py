@@ -33,13 +33,13 @@ class Critic(nn.Module):
 
 
 class LocalCritic(Critic):
-    """Observation entries ``[..., A, *]`` to values ``[..., A, 1]``, each member by itself."""
+    """Observation entries ``[..., A, *]`` to values ``[..., A, V]``, each member by itself."""
 
-    def __init__(self, obs: ObsLayout, cfg: ModelConfig) -> None:
+    def __init__(self, obs: ObsLayout, cfg: ModelConfig, streams: int = 1) -> None:
         super().__init__()
         self.encoder = Encoder(obs, cfg.normalize_obs)
         hidden = list(cfg.critic_hidden or cfg.hidden)
-        self.net = make_mlp(self.encoder.size, hidden, 1, cfg.activation, last_gain=CRITIC_GAIN)
+        self.net = make_mlp(self.encoder.size, hidden, streams, cfg.activation, last_gain=CRITIC_GAIN)
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return values."""
@@ -47,20 +47,20 @@ class LocalCritic(Critic):
 
 
 class CentralCritic(Critic):
-    """The whole team's observations, who is there and whom it judges, to values ``[..., A, 1]``.
+    """The whole team's observations, who is there and whom it judges, to values ``[..., A, V]``.
 
     The judged member enters as a one-hot index; its columns of the first layer are `member`, so that
     what all members have in common is computed once.
     """
 
-    def __init__(self, obs: ObsLayout, team_size: int, cfg: ModelConfig) -> None:
+    def __init__(self, obs: ObsLayout, team_size: int, cfg: ModelConfig, streams: int = 1) -> None:
         super().__init__()
         self.encoder = Encoder(obs, cfg.normalize_obs)
         first, *rest = list(cfg.critic_hidden or cfg.hidden)
         self.joint = linear(team_size * (self.encoder.size + 1), first, 2**0.5)
         self.member = nn.Parameter(torch.randn(team_size, first) * 0.1)
         self.activation = ACTIVATIONS[cfg.activation]()
-        self.net = make_mlp(first, rest, 1, cfg.activation, last_gain=CRITIC_GAIN)
+        self.net = make_mlp(first, rest, streams, cfg.activation, last_gain=CRITIC_GAIN)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return values; the arguments are the observation entries, ``present`` and ``departed``."""
@@ -71,9 +71,9 @@ class CentralCritic(Critic):
 
 
 class PooledCritic(Critic):
-    """A member's own features, its team's pooled and how many there are, to values ``[..., A, 1]``."""
+    """A member's own features, its team's pooled and how many there are, to values ``[..., A, V]``."""
 
-    def __init__(self, obs: ObsLayout, team_size: int, cfg: ModelConfig) -> None:
+    def __init__(self, obs: ObsLayout, team_size: int, cfg: ModelConfig, streams: int = 1) -> None:
         super().__init__()
         self.encoder = Encoder(obs, cfg.normalize_obs)
         first, *rest = list(cfg.critic_hidden or cfg.hidden)
@@ -92,7 +92,7 @@ class PooledCritic(Critic):
             else None
         )
 
-        self.net = make_mlp(2 * first + 1, rest or [first], 1, cfg.activation, last_gain=CRITIC_GAIN)
+        self.net = make_mlp(2 * first + 1, rest or [first], streams, cfg.activation, last_gain=CRITIC_GAIN)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return values; the arguments are the observation entries, ``present`` and ``departed``."""

@@ -29,7 +29,7 @@ EMBEDDING_GAIN = 0.125  # initial weights have variance 0.125 / width (T-Fixup, 
 
 
 class PocaCritic(nn.Module):
-    """Team value and members' baselines ``[..., A, 1]`` from the entries of a team.
+    """Team value and members' baselines ``[..., A, V]`` from the entries of a team.
 
     Args:
         obs: the observation entries of a member.
@@ -39,6 +39,7 @@ class PocaCritic(nn.Module):
             multiple of 4.
         head_size: what `head` takes beside the count, where a memory of another width stands before
             it; None: the last width.
+        streams: V, reward streams that have a value each.
     """
 
     draws_own_weights = True  # whatever model.weight_init says
@@ -50,6 +51,7 @@ class PocaCritic(nn.Module):
         team_size: int,
         cfg: ModelConfig,
         head_size: int | None = None,
+        streams: int = 1,
     ) -> None:
         super().__init__()
         self.layout, self.team_size = layout, team_size
@@ -72,7 +74,7 @@ class PocaCritic(nn.Module):
         self.trunk = nn.Sequential(*layers)
 
         self.size = size  # of the features, without the count
-        self.head = nn.Linear(size + 1 if head_size is None else head_size + 1, 1)
+        self.head = nn.Linear(size + 1 if head_size is None else head_size + 1, streams)
         nn.init.xavier_uniform_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
@@ -81,7 +83,7 @@ class PocaCritic(nn.Module):
         return self.value(*inputs)
 
     def value(self, *inputs: Tensor) -> Tensor:
-        """Return the team's value ``[..., A, 1]``, the same for every member.
+        """Return the team's value ``[..., A, V]``, the same for every member.
 
         Args:
             *inputs: the observation entries ``[..., A, *]``, then bool ``present`` and ``departed``
@@ -90,7 +92,7 @@ class PocaCritic(nn.Module):
         return self.head(self.features(*inputs))
 
     def baseline(self, *inputs: Tensor) -> Tensor:
-        """Return every member's baseline ``[..., A, 1]``: the value without knowing its own action.
+        """Return every member's baseline ``[..., A, V]``: the value without knowing its own action.
 
         Args:
             *inputs: as in `value`, then actions ``[..., A, C + K]`` as `ActionDistribution` draws them.

@@ -136,7 +136,7 @@ class RecurrentCritic(nn.Module):
             last = critic.net[-1]
             critic.net = critic.net[:-1]
             self.memory = Memory(last.in_features, cfg.memory, cfg.memory_size)
-            self.head = linear(self.memory.size, 1, 0.01)
+            self.head = linear(self.memory.size, last.out_features, 0.01)
         self.critic: Any = critic
 
     @property
@@ -164,13 +164,13 @@ class RecurrentCritic(nn.Module):
         return self._with_count(out, features), after
 
     def values(self, out: Tensor) -> Tensor:
-        """Return values ``[..., 1]``."""
+        """Return values ``[..., V]``."""
         return self.value_heads[0](out)
 
     def unroll(
         self, inputs: list[Tensor], action: Tensor | None, member: Tensor, states: TensorDictBase
     ) -> tuple[Tensor, Tensor | None]:
-        """Return values ``[B, L, 1]`` of sequences, and baselines where there are any.
+        """Return values ``[B, L, V]`` of sequences, and baselines where there are any.
 
         Args:
             inputs: the critic's entries ``[B, L, A, *]`` (``[B, L, *]`` if it sees the agent alone).

@@ -17,6 +17,7 @@ from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.actor_critic import PerMember
 from mappo_unity.learning.ppo import PolicyLearner
+from mappo_unity.learning.value_norm import by_stream
 from mappo_unity.policies.policy_files import Kind, choose_checkpoint
 from mappo_unity.policies.warm_start.agreement import check_agreement
 from mappo_unity.policies.warm_start.from_onnx import actor_tensors
@@ -110,7 +111,7 @@ def _from_checkpoint(path: Path, name: str, learner: PolicyLearner) -> tuple[str
 
     # the values of a critic are in the scale of the statistics under which it learnt
     whole = not any(row.reason for row in critic)
-    statistics = saved["value_norm"] if whole else {}
+    statistics = by_stream(saved["value_norm"]) if whole else {}
     norm = copy_fitting(
         learner.value_norm, "value_norm", statistics, {"": "it is of use to the whole critic only"}
     )
