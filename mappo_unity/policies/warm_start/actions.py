@@ -20,8 +20,8 @@ class Actions:
 
     Attributes: `mean` of continuous actions; `log_std` ``[C]`` where it does not depend on what is seen,
     `raw_std` the layer that gives our squashed actions' deviations, and `init_log_std` what these were at
-    first; `squashed`, whether the mean goes through tanh; `branches`, the logits of each, or of all combinations (`joint`); `branch_sizes`; `hidden`,
-    the name that all of them take.
+    first; `squashed`, whether the mean goes through tanh; `branches`, the logits of each, or of all
+    combinations (`joint`); `branch_sizes`; `hidden`, the name that all of them take.
     """
 
     mean: Linear | None
@@ -128,7 +128,7 @@ def _log_std(graph: OnnxGraph, std: str, size: int) -> np.ndarray | None:
 
 
 def _softplus_layer(graph: OnnxGraph, std: str) -> tuple[Linear | None, float | None]:
-    """Return the layer of ``softplus(raw + shift) + least``, and the initial log deviation; see `scale_shift`."""
+    """Return the layer of ``softplus(raw + shift) + least``, and the first log deviation (`scale_shift`)."""
     added = graph.with_constant(std, "Add")
     if added is None or graph.op(added[0]) != "Softplus":
         return None, None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,9 @@ from mappo_unity.policies.warm_start.sensors import Part
 ASSUMED_COUNT = 1e6
 """Observations that a file's normaliser counts as having seen: the file does not tell. So many are moved
 slowly by those of the game, and not at once, as by a normaliser that has seen none."""
+
+
+_ACTIVATIONS = {"SiLU": "silu", "LeakyReLU": "leaky_relu", "ReLU": "relu"}
 
 
 class Misfit(Exception):
@@ -114,7 +117,7 @@ def _columns(network: OnnxNetwork, encoder: Encoder, sensors: Sequence[Sequence[
             net: Any = encoder.images[place]
             if width != net.out[0].out_features:
                 raise Misfit(f"{part.input} has {width} features, here {net.out[0].out_features}")
-            start = encoder.vector + sum(int(e.out[0].out_features) for e in list(encoder.images)[:place])  # type: ignore[union-attr, index]
+            start = _image_starts(encoder)[place]
         else:
             start = part.start + _vector_start(network, part, sensors, starts)
         out.append(np.arange(start, start + width))
@@ -140,6 +143,12 @@ def _vector_start(
     return starts[index]
 
 
+def _image_starts(encoder: Encoder) -> list[int]:
+    """Return where the features of each image begin, behind the vectors."""
+    sizes = [net.out[0].out_features for net in encoder.images]  # type: ignore[union-attr, index]
+    return [encoder.vector + sum(sizes[:place]) for place in range(len(sizes))]
+
+
 def _image_place(part: Part, images: Sequence[int]) -> int:
     """Return which of the encoder's images a part is: obs_N counts all sensors, visual_..._N the images."""
     number = int(part.input.rpartition("_")[2])
@@ -153,6 +162,7 @@ def _encoder(network: OnnxNetwork, encoder: Encoder, columns: np.ndarray) -> dic
     """Return the tensors of the normaliser and of the images' encoders; raises Misfit."""
     out: dict[str, np.ndarray] = {}
     mean, inv_std = np.zeros(encoder.vector, np.float32), np.ones(encoder.vector, np.float32)
+    images = _image_starts(encoder)
     at = 0
     for part in network.parts:
         width = part.stop - part.start
@@ -160,7 +170,7 @@ def _encoder(network: OnnxNetwork, encoder: Encoder, columns: np.ndarray) -> dic
             mean[columns[at : at + width]], inv_std[columns[at : at + width]] = part.mean, part.inv_std
         at += width
         if part.image is not None:
-            out |= _image_tensors(part, encoder, columns[at - width] - encoder.vector)
+            out |= _image_tensors(part, encoder, images.index(int(columns[at - width])))
 
     norm = encoder.norm[0] if isinstance(encoder.norm, torch.nn.Sequential) else encoder.norm
     name = "norm.0" if isinstance(encoder.norm, torch.nn.Sequential) else "norm"
@@ -175,21 +185,28 @@ def _encoder(network: OnnxNetwork, encoder: Encoder, columns: np.ndarray) -> dic
     return out
 
 
-def _image_tensors(part: Part, encoder: Encoder, offset: int) -> dict[str, np.ndarray]:
+def _image_tensors(part: Part, encoder: Encoder, place: int) -> dict[str, np.ndarray]:
+    """Return the tensors of an image's encoder by their names in the network's; raises Misfit."""
     assert part.image is not None
-    place = offset // (part.stop - part.start)
-    net: Any = encoder.images[place]
-    own = [layer for layer in net.conv if isinstance(layer, torch.nn.Conv2d)]
-    theirs = part.image.convolutions
-    kinds = {layer.activation for layer in theirs} | {part.image.activation}
-    if kinds != {"silu"}:
-        raise Misfit(f"{part.input} goes through {', '.join(sorted(kinds))}, images here through silu")
-    if [(c.strides, c.pads) for c in theirs] != [(c.stride, (*c.padding, *c.padding)) for c in own]:
-        raise Misfit(f"{part.input} has convolutions of other steps or margins than images here")
+    layers = {name: layer for name, layer in encoder.images[place].named_modules() if name}
+    convolutions = {name: layer for name, layer in layers.items() if isinstance(layer, torch.nn.Conv2d)}
+    here = {_ACTIVATIONS[kind] for layer in layers.values() if (kind := type(layer).__name__) in _ACTIVATIONS}
+    sizes = [(c.out_channels, c.kernel_size[0], c.stride[0], c.padding[0]) for c in convolutions.values()]
+    theirs = [layer.size for layer in part.image.convolutions]
+    if sizes != theirs or here != part.image.activations:
+        raise Misfit(
+            f"{part.input} goes through convolutions {_show(theirs)} "
+            f"({', '.join(sorted(part.image.activations))}), here through {_show(sizes)} "
+            f"({', '.join(sorted(here))})"
+        )
 
-    out = {f"images.{place}.out.0.weight": part.image.out.weight}
-    out[f"images.{place}.out.0.bias"] = part.image.out.bias
-    for index, layer in enumerate(theirs):
-        out[f"images.{place}.conv.{2 * index}.weight"] = layer.weight
-        out[f"images.{place}.conv.{2 * index}.bias"] = layer.bias
+    found = zip(convolutions, [(layer.weight, layer.bias) for layer in part.image.convolutions])
+    pairs = {**dict(found), "out.0": (part.image.out.weight, part.image.out.bias)}
+    out: dict[str, np.ndarray] = {}
+    for name, (weight, bias) in pairs.items():
+        out[f"images.{place}.{name}.weight"], out[f"images.{place}.{name}.bias"] = weight, bias
     return out
+
+
+def _show(sizes: Iterable[tuple[int, ...]]) -> str:
+    return " ".join("x".join(map(str, size)) for size in sizes) or "none"

@@ -8,27 +8,51 @@ import numpy as np
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.encoders import OBS_CLIP
-from mappo_unity.policies.warm_start.graph import Linear, OnnxGraph
+from mappo_unity.policies.warm_start.graph import SAME_NUMBERS, Linear, OnnxGraph
 
 _COPIES = ("Identity", "Dropout", "Cast")
+_OF_IMAGES = (*SAME_NUMBERS, "Conv", "MaxPool", "Add", "Mul", "Sigmoid", "Relu", "LeakyRelu")
+"""Operators between an image and its linear layer."""
+_KINDS = {
+    (): "dense",
+    ((16, 8, 4, 0), (32, 4, 2, 0)): "simple",
+    ((32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0)): "nature",
+    ((35, 3, 1, 0), (144, 3, 1, 0)): "match3",
+}
+"""Encoders of ML-Agents (trainers/torch_entities/encoders.py) by their convolutions."""
+RESNET_CONVOLUTIONS = 3 * (1 + 2 * 2)  # of each stack one, and two blocks of two
 
 
 class Convolution(NamedTuple):
-    """A convolution and the activation behind it."""
+    """A convolution."""
 
     weight: np.ndarray  # [out, in, height, width]
     bias: np.ndarray
-    strides: tuple[int, ...]
-    pads: tuple[int, ...]
-    activation: str
+    stride: int
+    padding: int
+
+    @property
+    def size(self) -> tuple[int, int, int, int]:
+        """Channels out, side of the kernel, stride and padding."""
+        return (len(self.weight), self.weight.shape[-1], self.stride, self.padding)
 
 
 class Image(NamedTuple):
-    """The encoder of an image: convolutions, then a linear layer with an activation."""
+    """The encoder of an image: convolutions, first to last, then a linear layer with an activation."""
 
     convolutions: list[Convolution]
     out: Linear
-    activation: str
+    activations: frozenset[str]
+
+    @property
+    def kind(self) -> str:
+        """What `model.image_encoder` calls it; "" for one that it does not know."""
+        if self.activations == {"silu"}:
+            return "auto"
+        if len(self.convolutions) == RESNET_CONVOLUTIONS and "silu" in self.activations:
+            return "resnet"
+        sizes = tuple(convolution.size for convolution in self.convolutions)
+        return _KINDS.get(sizes, "") if self.activations == {"leaky_relu"} else ""
 
 
 class Part(NamedTuple):
@@ -135,29 +159,32 @@ def _image(graph: OnnxGraph, name: str) -> Part | None:
     found = read_convolutions(graph, out.x) if out is not None else None
     if active is None or out is None or found is None:
         return None
-    return Part(found[0], 0, len(out.bias), image=Image(found[1], out, active[1]))
+    source, convolutions, activations = found
+    return Part(source, 0, len(out.bias), image=Image(convolutions, out, activations | {active[1]}))
 
 
-def read_convolutions(graph: OnnxGraph, name: str) -> tuple[str, list[Convolution]] | None:
-    """Return the input and the convolutions, first to last, that a name was made by; None: by others."""
-    convolutions: list[Convolution] = []
-    while True:
-        name = graph.through(name)
-        active = graph.activation(name)
-        node = graph.node(active[0]) if active is not None else None
-        if active is None or node is None or node.op_type != "Conv":
-            break
+def read_convolutions(graph: OnnxGraph, name: str) -> tuple[str, list[Convolution], frozenset[str]] | None:
+    """Return the image, the convolutions (first to last) and the activations that made a name; None: others.
 
-        weight = graph.constant(node.input[1])
-        if weight is None:
-            break
-        bias = graph.constant(node.input[2]) if len(node.input) > 2 else None
-        sizes = {"strides": [1, 1], "pads": [0, 0, 0, 0]} | graph.attributes(node)
-        strides, pads = tuple(sizes["strides"]), tuple(sizes["pads"])
-        bias = np.zeros(len(weight), np.float32) if bias is None else bias
-        convolutions.append(Convolution(weight, bias, strides, pads, active[1]))
-        name = node.input[0]
-
-    if not convolutions or len(graph.inputs.get(name, ())) != 3:
+    Where convolutions are added to what they were given (ResNet) they stand in the order of the file.
+    """
+    way = set(graph.behind(name, lambda at: False))
+    images = [at for at in way if len(graph.inputs.get(at, ())) == 3]
+    nodes = [node for node in graph.model.graph.node if way & set(node.output) and node.op_type != "Constant"]
+    if len(images) != 1 or way & set(graph.inputs) != set(images):
         return None
-    return name, convolutions[::-1]
+    if any(node.op_type not in _OF_IMAGES for node in nodes):
+        return None
+
+    convolutions = []
+    for node in nodes:
+        weight = graph.constant(node.input[1]) if node.op_type == "Conv" else None
+        if weight is None:
+            continue
+        bias = graph.constant(node.input[2]) if len(node.input) > 2 else None
+        sizes = {"strides": [1], "pads": [0]} | graph.attributes(node)
+        bias = np.zeros(len(weight), np.float32) if bias is None else bias
+        convolutions.append(Convolution(weight, bias, int(sizes["strides"][0]), int(sizes["pads"][0])))
+
+    active = [graph.activation(output) for node in nodes for output in node.output]
+    return images[0], convolutions, frozenset(kind for _, kind in filter(None, active))
