@@ -295,6 +295,28 @@ class Staggered(Probe):
         return self.clock >= 4, np.zeros(self.teams, bool)
 
 
+class Chain(Probe):
+    """24 cells; the right choice, which alternates, leads on, a wrong one back to the first. Reward 1 at
+    the last: by chance it takes eight million tries."""
+
+    obs_size = 24
+
+    def begin(self, teams):
+        self.cell = np.where(teams, 0, getattr(self, "cell", np.zeros(self.teams, int)))
+
+    def observe(self):
+        return np.eye(self.obs_size)[self.cell][:, None]
+
+    def earn(self, choice):
+        right = (choice[:, 0] > 0) == (self.cell % 2 == 0)
+        self.cell = np.where(right, np.minimum(self.cell + 1, self.obs_size - 1), 0)
+        return (self.cell == self.obs_size - 1).astype(float)[:, None], np.zeros(self.teams)
+
+    def ends(self):
+        late = self.clock >= 48
+        return (self.cell == self.obs_size - 1) | late, late
+
+
 class NewIds(ObsActionReward):
     """As `ObsActionReward`, but every episode comes under a new id."""
 
@@ -390,6 +412,7 @@ PROBES = {
         *(Constant, ObsReward, Delayed, ActionReward, ObsActionReward),
         *(Credit, MateKnows, EarlyDeath, Staggered, NewIds, TimeLimit, RealEnd),
         *(Recall, LongRecall, StaggeredRecall, TeamRecall),
+        Chain,
     )
 }
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from mappo_unity.config.schema import ModelConfig, bounded_log_std
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.policies.layouts import describe_spec, same_layout
 from mappo_unity.runs.checkpoint import CheckpointError
 
@@ -48,6 +49,19 @@ def check_compatible(
 
     if different:
         raise CheckpointError(f"checkpoint {path} holds another network: {'; '.join(different)}")
+
+
+def check_streams(path: Path, saved: dict[str, Any], learners: dict[str, PolicyLearner]) -> None:
+    """Refuse a checkpoint whose critics have values for other reward streams, saying which."""
+    for name, learner in learners.items():
+        there = set(saved[name].get("rewards", {}))
+        here = {stream.name for stream in learner.rewards.intrinsic}
+        for stream in sorted(there ^ here):
+            state, other = ("on", "off") if stream in there else ("off", "on")
+            raise CheckpointError(
+                f"checkpoint {path} holds another critic of {name}: rewards.{stream} is {state} there and "
+                f"{other} here; its strength may change with resume, but not from or to 0"
+            )
 
 
 def plain(value: Any) -> Any:

@@ -19,7 +19,12 @@ from mappo_unity.runs.rng import get_rng_state, set_rng_state
 from mappo_unity.training.batches import Batch
 from mappo_unity.training.episode_stats import RecentEpisodes
 from mappo_unity.training.match_series import MatchSeries
-from mappo_unity.training.resume_check import check_compatible, describe_models, describe_policies
+from mappo_unity.training.resume_check import (
+    check_compatible,
+    check_streams,
+    describe_models,
+    describe_policies,
+)
 from mappo_unity.training.setup import TrainingSetup
 
 _COUNTERS = (
@@ -149,6 +154,7 @@ class RunState:
         """
         state = checkpoint.load(path)
         check_compatible(path, state, self.cfg.env.name, self._layout(), self._models())
+        check_streams(path, state["learners"], self.setup.learners)
         if guessed_otherwise(state["layout"], self._layout()):
             self.setup.guess_channels()
 
