@@ -117,7 +117,7 @@ def test_behaviors_may_have_any_name() -> None:
         "My Ball": {"ppo": {"optimizer": "adamw"}},
         "Goalie": {"ppo": {"lr": 0.1}},
     }
-    model, ppo = behavior_config(config, "3DBall")
+    model, ppo, _ = behavior_config(config, "3DBall")
     assert (model.hidden, ppo.lr, ppo.gamma) == ([8, 4], 2e-4, 0.9)
 
 

@@ -139,9 +139,9 @@ def test_joint_branches_are_the_same_actions_under_one_categorical():
 
 def test_options_of_one_behavior():
     cfg = Config(behaviors={"Goalie": {"ppo": {"lr": 1e-5}, "model": {"hidden": [7]}}})
-    model, ppo = behavior_config(cfg, "Goalie")
+    model, ppo, _ = behavior_config(cfg, "Goalie")
     assert (model.hidden, ppo.lr, ppo.gamma) == ([7], 1e-5, cfg.ppo.gamma)
-    assert behavior_config(cfg, "Striker") == (cfg.model, cfg.ppo)
+    assert behavior_config(cfg, "Striker") == (cfg.model, cfg.ppo, cfg.rewards)
     check_behaviors(cfg, ["Goalie", "Striker"])
 
 
@@ -149,7 +149,7 @@ def test_options_of_one_behavior():
     ("behaviors", "message"),
     [
         ({"Golie": {}}, r"behaviors\.Golie: the environment has no behavior 'Golie'; it has Goalie, Striker"),
-        ({"Goalie": {"pp": {}}}, "only the sections model and ppo"),
+        ({"Goalie": {"pp": {}}}, "only the sections model, ppo, rewards, init_from and train"),
         (
             {"Goalie": {"ppo": {"lrr": 1}}},
             r"behaviors\.Goalie\.ppo\.lrr: there is no such option; did you mean lr",

@@ -76,6 +76,10 @@ def test_an_exported_actor_comes_back(name: str, tmp_path: Path) -> None:
     sensors, continuous, branches, options = CASES[name]
     actor, path = make(sensors, continuous, branches, **options), tmp_path / "own.onnx"
     path.write_bytes(data_of(actor, sensors))
+    if name.startswith(("entit", "goal")):
+        with pytest.raises(ConfigError, match="can be read"):
+            read_network(path)
+        return
 
     again, rows = started(path, sensors, continuous, branches)
     assert skipped(rows) == ["critic"]

@@ -208,5 +208,5 @@ def _image_tensors(part: Part, encoder: Encoder, place: int) -> dict[str, np.nda
     return out
 
 
-def _show(sizes: Iterable[tuple[int, ...]]) -> str:
+def _show(sizes: Iterable[tuple[Any, ...]]) -> str:
     return " ".join("x".join(map(str, size)) for size in sizes) or "none"

@@ -91,8 +91,9 @@ def read_network(path: Path) -> OnnxNetwork:
         features = layers.pop(0).output
     if not layers:
         raise ConfigError(
-            f"{path}: its network has no hidden layer that can be read: it comes from "
-            f"{graph.op(graph.through(features)) or 'its inputs'}"
+            f"{path}: its network has no hidden layer that can be read: its actions come from "
+            f"{graph.op(graph.through(features)) or 'its inputs'}; linear layers with an activation can be "
+            "read, goal conditioning cannot"
         )
 
     kinds = {(layer.activation, layer.norm is not None) for layer in layers}

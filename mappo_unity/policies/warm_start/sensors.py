@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -106,7 +106,8 @@ def _columns(graph: OnnxGraph, name: str) -> Part:
 
     raise ConfigError(
         f"{graph.path}: what it sees goes through {op or 'an input of another shape'} ({name}), which "
-        "networks here do not have: vectors, normalised or not, and convolved images can be read"
+        "is not understood: vectors, normalised or not, and convolved images can be read, attention over "
+        "entities cannot"
     )
 
 
@@ -114,7 +115,7 @@ def _bounds(graph: OnnxGraph, name: str, size: int) -> tuple[int, int]:
     """Return the columns that a Slice or one output of a Split takes."""
     node = graph.node(name)
     attributes = graph.attributes(node)
-    more = [graph.constant(entry) for entry in node.input[1:]]
+    more: list[Any] = [graph.constant(entry) for entry in node.input[1:]]
     if node.op_type == "Split":
         given = attributes.get("split", more[0] if more else None)
         count = len(node.output)

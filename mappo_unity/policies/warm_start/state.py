@@ -41,12 +41,12 @@ def read_state(graph: OnnxGraph, hidden: str) -> State | None:
 
 
 def _lstm(graph: OnnxGraph, node: Any) -> State:
-    values = [graph.constant(name) for name in node.input[1:4]]
+    values = [value for name in node.input[1:4] if (value := graph.constant(name)) is not None]
     size = int(graph.attributes(node)["hidden_size"])
-    if any(value is None for value in values) or values[0].shape[0] != 1:
+    if len(values) != 3 or values[0].shape[0] != 1:
         raise ConfigError(f"{graph.path}: its LSTM is of two directions, or its weights are no constants")
 
-    given, kept, biases = (value[0] for value in values if value is not None)
+    given, kept, biases = (value[0] for value in values)
     names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
     arrays = (given, kept, biases[: 4 * size], biases[4 * size :])
     weights = {name: _ifco(array, size) for name, array in zip(names, arrays)}
@@ -77,8 +77,9 @@ def _gru(graph: OnnxGraph, hidden: str) -> State | None:
 
     reset, of_state = graph.node(scaled).input
     sums = [list(graph.node(graph.node(gate).input[0]).input) for gate in (reset, update)]
-    pairs = [[graph.linear(name) for name in names] for names in [*sums, [of_input, of_state]]]
-    if any(layer is None for pair in pairs for layer in pair):
+    names = [*sums, [of_input, of_state]]
+    pairs = [[layer for name in pair if (layer := graph.linear(name)) is not None] for pair in names]
+    if any(len(pair) != 2 for pair in pairs):
         return None
 
     weights = {
