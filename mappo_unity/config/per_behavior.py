@@ -1,4 +1,7 @@
-"""Options of one behavior name: the sections of its learner, with its own overrides on top."""
+"""Options of one behavior name: the sections of its learner, with its own overrides on top.
+
+Beside them stand `init_from`, what its networks begin with, and `train`, whether they learn.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mappo_unity.config.schema import BCConfig, Config, ModelConfig, PPOConfig, RewardsConfig
 from mappo_unity.errors import ConfigError
+
+INIT_FROM, TRAIN = "init_from", "train"
 
 
 class BehaviorConfig(NamedTuple):
@@ -52,14 +57,35 @@ def behavior_config(cfg: Config, policy: str) -> BehaviorConfig:
     if not isinstance(own, dict):
         raise ConfigError(f"{where}={own!r} must hold sections, for example {where}.ppo.lr=1e-4")
 
-    *others, last = sections = BehaviorConfig._fields
+    sections = BehaviorConfig._fields
     for section in own:
-        if section not in sections:
+        if section not in (*sections, INIT_FROM, TRAIN):
             raise ConfigError(
-                f"{where}.{section}: only the sections {', '.join(others)} and {last} can differ by behavior"
+                f"{where}.{section}: only the sections {', '.join(sections)}, {INIT_FROM} and {TRAIN} can "
+                "differ by behavior"
             )
+    if not isinstance(own.get(INIT_FROM), (str, type(None))) or own.get(INIT_FROM) == "":
+        raise ConfigError(
+            f"{where}.{INIT_FROM}={own[INIT_FROM]!r} must name a run folder, a checkpoint or an ONNX file; "
+            "null: new networks"
+        )
+    if not isinstance(own.get(TRAIN, True), bool):
+        raise ConfigError(f"{where}.{TRAIN}={own[TRAIN]!r} must be true or false")
 
     return BehaviorConfig(*(_merged(getattr(cfg, s), own.get(s), f"{where}.{s}") for s in sections))
+
+
+def init_source(cfg: Config, policy: str) -> tuple[str, str | None]:
+    """Return the option that says what a policy begins with, and its value; None: with new weights."""
+    own = cfg.behaviors.get(policy) or {}
+    if INIT_FROM in own:
+        return f"behaviors.{policy}.{INIT_FROM}", own[INIT_FROM]
+    return INIT_FROM, cfg.init_from
+
+
+def is_frozen(cfg: Config, policy: str) -> bool:
+    """Return whether a policy only plays (`behaviors.NAME.train=false`)."""
+    return not (cfg.behaviors.get(policy) or {}).get(TRAIN, True)
 
 
 def _merged(section: Any, own: Any, where: str) -> Any:

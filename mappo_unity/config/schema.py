@@ -408,6 +408,9 @@ class PPOConfig:
     """Weight of its team's reward."""
     death_masking: bool = True
     """A member that ended while its team plays on keeps earning the team's reward until the team ends."""
+    critic_warmup_steps: int = 0
+    """Agent decisions until which only the critic learns, so that a new one does not spoil a trained actor
+    (init_from)."""
     normalize_advantages: bool = True
     """Normalise advantages over the acting agents of a batch."""
     max_grad_norm: Optional[float] = 0.5
@@ -428,6 +431,7 @@ class PPOConfig:
         _between("ppo.clip_epsilon", self.clip_epsilon, 0, 1)
         _between("ppo.clip_epsilon_final", self.clip_epsilon_final, 0, 1)
 
+        _at_least("ppo.critic_warmup_steps", self.critic_warmup_steps, 0)
         _at_least("ppo.epochs", self.epochs, 1)
         _at_least("ppo.minibatch_size", self.minibatch_size, 1)
         _at_least("ppo.num_minibatches", self.num_minibatches, 1)
@@ -648,7 +652,7 @@ class Config:
     """Metrics and progress."""
     behaviors: dict[str, Any] = field(default_factory=dict)
     """Options of one behavior name: behaviors.Goalie.ppo.lr=1e-4 overrides ppo.lr for Goalie; sections
-    ppo, model, rewards and bc."""
+    ppo, model, rewards and bc, init_from, and train=false for one that only plays."""
     seed: int = 0
     """Seed of the environment, the networks and the sampling."""
     max_steps: int = 1_000_000
@@ -667,6 +671,8 @@ class Config:
     """Threads of torch while learning, at most one a core; large minibatches gain where a core is idle."""
     resume: Optional[str] = None
     """Run folder or checkpoint file to resume, in the same folder."""
+    init_from: Optional[str] = None
+    """Run folder, checkpoint or ONNX file whose networks a new run begins with, as far as they fit."""
     stop_at_return: Optional[float] = None
     """End the run when return_mean over a full window reaches this."""
     max_jobs: int = 1000

@@ -35,6 +35,7 @@ from mappo_unity.scenes.contract.rules import (
     note_silence,
     silence_error,
 )
+from mappo_unity.scenes.contract.statistics import Statistics, pop_statistics
 
 
 class CrashedEpisodes(NamedTuple):
@@ -94,6 +95,10 @@ class UnityEnv(EnvBase):
         """Return the episodes that finished since the last call, a list for each behavior."""
         return {name: behavior.returns.pop() for name, behavior in self._behaviors.items()}
 
+    def pop_statistics(self) -> Statistics:
+        """Return what the environment reported of itself since the last call; raises EnvironmentDataError."""
+        return pop_statistics(self.base_env)
+
     _crashed: list[CrashedEpisodes]
     rounds: int = 0  # rounds played since the environment was opened
 
@@ -152,6 +157,7 @@ class UnityEnv(EnvBase):
             behavior.set_state(state["behaviors"][name])
 
         self._untouched = True
+        self.pop_statistics()  # what opening it reported is no part of the state
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the BaseEnv."""

@@ -1,13 +1,16 @@
-"""The optimizer of an actor and a critic: its groups, its gradients, older states of it."""
+"""The optimizer of an actor and a critic: its groups, gradients, older states, a critic's warm-up."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from mappo_unity import keys
 from mappo_unity.config.schema import Optimizer, PPOConfig
 from mappo_unity.learning.advantage import scheduled
 
@@ -54,3 +57,34 @@ def clip_gradients(optimizer: torch.optim.Optimizer, cfg: PPOConfig) -> Tensor:
 
     norms = [nn.utils.clip_grad_norm_(group, limit, foreach=True) for group in groups]
     return norms[0] if len(norms) == 1 else torch.stack(norms).norm()
+
+
+class CriticWarmup:
+    """Let the critic learn alone until so many decisions were collected: a new one beside a trained actor.
+
+    Args:
+        steps: agent decisions; 0: never.
+        actor: what stands still until then, its normaliser too.
+
+    Attributes: `decisions`, collected so far; `active`, whether the critic alone learns the newest batch.
+    """
+
+    def __init__(self, steps: int, actor: nn.Module) -> None:
+        self.steps, self.decisions, self.active = steps, 0, False
+        self._still = set(actor.modules())
+
+    def begin(self, batch: TensorDictBase) -> dict[str, float]:
+        """Take note of a batch that is about to be learnt; return a metric, where there is a warm-up."""
+        self.active = self.decisions < self.steps
+        self.decisions += int(batch.get(keys.ACTING).sum())
+        return {"critic_warmup": float(self.active)} if self.steps else {}
+
+    def total(self, losses: Mapping[str, Tensor]) -> Tensor:
+        """Return what is minimised now."""
+        if self.active:
+            return losses["loss_critic"]
+        return losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+
+    def moving(self, norms: Iterable[nn.Module]) -> list[Any]:
+        """Return the normalisers that move now."""
+        return [norm for norm in norms if not (self.active and norm in self._still)]

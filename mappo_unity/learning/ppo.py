@@ -42,6 +42,7 @@ from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_
 from mappo_unity.learning.networks.encoders import RunningNorm
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.optimizer import (
+    CriticWarmup,
     clip_gradients,
     in_two_groups,
     make_optimizer,
@@ -76,6 +77,7 @@ class PolicyLearner:
         actor.keeps_components = cfg.ratio is RatioKind.component
         self.loss = MaskedClipPPOLoss(actor, critic, cfg)
         self.optimizer = make_optimizer(actor, critic, cfg)
+        self.warmup = CriticWarmup(cfg.critic_warmup_steps, actor)
         self.params = [*actor.parameters(), *critic.parameters()]
         is_normalized = cfg.normalize_values is not ValueNormKind.none
         self.value_norm = ValueNorm(cfg.value_norm_beta, is_normalized, len(self.rewards.names))
@@ -94,17 +96,14 @@ class PolicyLearner:
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
 
     def learn(self, batch: TensorDictBase, following: TensorDictBase, progress: float) -> dict[str, float]:
-        """Improve the networks by one batch.
+        """Improve the networks by one batch; return metrics.
 
         Args:
             batch: ``[T, ..., A]`` entries of this policy name, as collected; ``next`` holds rewards and ends.
             following: what was seen after them, see `keys.FINAL`, `keys.CUT_OFF` and `keys.CUT_OFF_AT`.
             progress: share of the run that is over, 0 to 1, for the schedules.
-
-        Returns:
-            Metrics.
         """
-        settings = self._set_schedules(progress)
+        settings = self._set_schedules(progress) | self.warmup.begin(batch)
         metrics: dict[str, float] = {}
         if self.cloning is None or not self.cloning.cfg.only:
             buffer, metrics = self.prepare(batch, following)
@@ -233,7 +232,7 @@ class PolicyLearner:
         if self.cfg.value_norm_update is ValueNormUpdate.minibatch:
             move_with_minibatch(self.value_norm, minibatch)
         losses = self.loss(minibatch)
-        total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        total = self.warmup.total(losses)
 
         self.optimizer.zero_grad()
         total.backward()
@@ -259,7 +258,7 @@ class PolicyLearner:
         """Take the batch's observations into the normalisers, after the update that must not see it."""
         if self.norms:
             rows = batch.get(keys.OBS)[batch.get(keys.ACTING).squeeze(-1)]
-            for norm in self.norms:
+            for norm in self.warmup.moving(self.norms):
                 norm.update(rows)
 
     def _trainable_state(self) -> dict[str, Any]:
@@ -284,6 +283,7 @@ class PolicyLearner:
             "cloning": None if self.cloning is None else self.cloning.state_dict(),
             "updates": self.updates,
             "rollbacks": self.rollbacks,
+            "decisions": self.warmup.decisions,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -295,5 +295,5 @@ class PolicyLearner:
             self.cloning.load_state_dict(state["cloning"])
         self.carried.load_state_dict(state.get("carried"), self.params[0].device)
         self.reader.load_state_dict(state.get("critic_states", {}))
-        self.rollbacks = int(state["rollbacks"])
+        self.rollbacks, self.warmup.decisions = int(state["rollbacks"]), int(state.get("decisions", 0))
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2

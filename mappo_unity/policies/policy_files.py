@@ -53,7 +53,7 @@ class Source:
     option: str
 
 
-def locate(where: str, option: str) -> Source:
+def locate(where: str, option: str, wanted: str = PLAYABLE) -> Source:
     """Return what a path is that an option names as a policy.
 
     Raises:
@@ -63,10 +63,10 @@ def locate(where: str, option: str) -> Source:
     if where == RANDOM:
         return Source(Kind.random, path, option)
 
-    check_there(path, option, f": give {PLAYABLE}")
+    check_there(path, option, f": give {wanted}")
     if path.is_dir():
         return _folder(path, option)
-    return Source(_kind_of_file(path, option, PLAYABLE), path, option)
+    return Source(_kind_of_file(path, option, wanted), path, option)
 
 
 def check_resumable(path: Path, option: str) -> None:

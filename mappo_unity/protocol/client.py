@@ -16,8 +16,6 @@ from mlagents_envs import __version__ as MLAGENTS_VERSION
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
 from mlagents_envs.side_channel import SideChannel
-from mlagents_envs.side_channel.engine_configuration_channel import EngineConfigurationChannel
-from mlagents_envs.side_channel.side_channel_manager import SideChannelManager
 
 from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.protocol import decode, messages
@@ -32,8 +30,9 @@ from mappo_unity.protocol.player_failures import (
 from mappo_unity.protocol.player_options import PlayerOptions
 from mappo_unity.protocol.process import PlayerProcess
 from mappo_unity.protocol.server import Link, LinkTimeout
-from mappo_unity.protocol.side_channels import ParametersChannel
+from mappo_unity.protocol.side_channels import TrainerChannels
 from mappo_unity.scenes.contract.images import sends_channels_last
+from mappo_unity.scenes.contract.statistics import Statistics
 
 CLOSE_S = 5.0  # how long a player may take to leave before it is killed
 
@@ -57,11 +56,7 @@ class UnityPlayer(BaseEnv):
     ) -> None:
         self.options, self.seed = options, seed
 
-        self._parameters, self._engine = ParametersChannel(), EngineConfigurationChannel()
-        self._channels = SideChannelManager([self._parameters, self._engine, *(side_channels or [])])
-        self._engine.set_configuration_parameters(**options.engine)
-        for name, value in options.parameters.items():
-            self.set_parameter(name, value)
+        self._channels = TrainerChannels(options.parameters, options.engine, side_channels or [], seed)
 
         self._decoders: dict[str, BehaviorDecoder] = {}
         self._encoders: dict[str, ActionEncoder] = {}
@@ -147,11 +142,15 @@ class UnityPlayer(BaseEnv):
 
     def set_parameter(self, name: str, value: Value) -> None:
         """Set an environment parameter of the player, with its next step."""
-        self._parameters.send(name, value, self.seed)
+        self._channels.parameters.send(name, value, self.seed)
 
     def set_time_scale(self, scale: float) -> None:
         """Let the player run so much faster than real time, from the next step on."""
-        self._engine.set_configuration_parameters(time_scale=scale)
+        self._channels.engine.set_configuration_parameters(time_scale=scale)
+
+    def pop_statistics(self) -> Statistics:
+        """Return what the game reported of itself (StatsRecorder) since the last call."""
+        return self._channels.pop_statistics()
 
     # ---- BaseEnv ------------------------------------------------------------------------------------------
 

@@ -139,9 +139,12 @@ def initialization(scene: str, package_version: str, brain_parameters: Sequence[
     )
 
 
-def output(agent_infos: dict[str, bytes], initialization_output: bytes | None = None) -> bytes:
-    """Return a UnityOutputProto of the behaviors' agent lists."""
-    content = delimited(1, b"".join(map_entry(2, name, infos) for name, infos in agent_infos.items()))
+def output(
+    agent_infos: dict[str, bytes], initialization_output: bytes | None = None, side_channel: bytes = b""
+) -> bytes:
+    """Return a UnityOutputProto of the behaviors' agent lists and of messages on side channels."""
+    infos = b"".join(map_entry(2, name, infos) for name, infos in agent_infos.items())
+    content = delimited(1, infos + (delimited(3, side_channel) if side_channel else b""))
     return content if initialization_output is None else content + delimited(2, initialization_output)
 
 

@@ -14,6 +14,7 @@ from mlagents_envs.exception import UnityActionException
 
 from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.protocol.restarting_player import RestartingPlayer
+from mappo_unity.scenes.contract.statistics import Statistics, join_statistics
 
 
 class SeveralPlayers(BaseEnv):
@@ -35,6 +36,13 @@ class SeveralPlayers(BaseEnv):
             for name, agents in player.crashed_agents.items():
                 out[name] = np.concatenate([out.get(name, agents[:0]), self._outward(agents, p)])
         return out
+
+    def pop_statistics(self) -> Statistics:
+        """Return what the games reported of themselves since the last call.
+
+        Player 0's values come last: as in ML-Agents, "the most recent" one is its.
+        """
+        return join_statistics(player.pop_statistics() for player in reversed(self.players))
 
     @property
     def behavior_specs(self) -> BehaviorMapping:

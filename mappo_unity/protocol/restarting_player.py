@@ -18,6 +18,7 @@ from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.protocol.client import MakePlayer, UnityPlayer
 from mappo_unity.protocol.player_failures import PlayerFailure
+from mappo_unity.scenes.contract.statistics import Statistics, join_statistics
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 """Pause before the second try in a row (before the first there is none), doubled with every further one."""
@@ -55,6 +56,7 @@ class RestartingPlayer(BaseEnv):
         self._crashed_steps: dict[str, TerminalSteps] = {}
         self._parameters: dict[str, Value] = {}  # set since the first player was started
         self._specs = BehaviorMapping({})
+        self._statistics: Statistics = {}  # of players that failed
 
         self.player: UnityPlayer = make_player(seed)
 
@@ -98,9 +100,16 @@ class RestartingPlayer(BaseEnv):
             self._crashed_steps = self._end_crashed_episodes()
             self.crashed_agents = {name: steps.agent_id for name, steps in self._crashed_steps.items()}
             self._last.clear()
+            self._statistics = self.pop_statistics()
             self._start_another(failure)
 
         self._took_steps()
+
+    def pop_statistics(self) -> Statistics:
+        """Return what the game reported of itself since the last call."""
+        out = join_statistics([self._statistics, self.player.pop_statistics()])
+        self._statistics = {}
+        return out
 
     # ---- BaseEnv ------------------------------------------------------------------------------------------
 

@@ -29,6 +29,7 @@ from mappo_unity.config.parameters.values import show_parameter  # noqa: E402
 from mappo_unity.protocol import encode, messages, side_channels  # noqa: E402
 from mappo_unity.protocol.messages import STATUS_OK, STATUS_QUIT  # noqa: E402
 from mappo_unity.protocol.ports import EDITOR_PORT  # noqa: E402
+from mappo_unity.scenes.contract.statistics import pop_statistics  # noqa: E402
 
 CONNECT_TIMEOUT_S = 60.0
 """How long a player looks for its trainer."""
@@ -242,7 +243,8 @@ class Player:
             agent_infos[name] = self.encoders[name].encode(decision, terminal)
 
         hello = encode.initialization(self.scene, __version__, came_up) if came_up else None
-        return encode.output(agent_infos, hello)
+        statistics = side_channels.statistics_messages(pop_statistics(self.env))
+        return encode.output(agent_infos, hello, statistics)
 
     def _read_side_channels(self, data: bytes) -> None:
         for channel, content in side_channels.split(data):

@@ -1,19 +1,24 @@
-"""Side channels: environment parameters as a trainer sends them, and what a player reads of them.
+"""Side channels: environment parameters, engine settings and statistics, at both ends.
 
-The layout of the messages is that of the outgoing side in mlagents_envs.side_channel.
+The layout of the messages is that of the other end in mlagents_envs.side_channel.
 """
 
 from __future__ import annotations
 
+import logging
 import struct
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from mlagents_envs.side_channel import IncomingMessage
+from mlagents_envs.side_channel import IncomingMessage, OutgoingMessage, SideChannel
+from mlagents_envs.side_channel.engine_configuration_channel import EngineConfigurationChannel
 from mlagents_envs.side_channel.environment_parameters_channel import EnvironmentParametersChannel
+from mlagents_envs.side_channel.side_channel_manager import SideChannelManager
+from mlagents_envs.side_channel.stats_side_channel import StatsSideChannel
 
 from mappo_unity.config.parameters.samplers import KINDS, SAMPLER, Sampler, Value, read_value
+from mappo_unity.scenes.contract.statistics import AGGREGATIONS, Statistics
 
 PARAMETERS = uuid.UUID("534c891e-810f-11ea-a9d0-822485860400")
 """EnvironmentParametersChannel."""
@@ -21,8 +26,59 @@ ENGINE = uuid.UUID("e951342c-4f7e-11ea-b238-784f4387d1f7")
 """EngineConfigurationChannel."""
 ANALYTICS = uuid.UUID("b664a4a9-d86f-5a5f-95cb-e8353a7e8356")
 """DefaultTrainingAnalyticsSideChannel: says what trains; nothing to do."""
+STATISTICS = uuid.UUID("a1d8f7b7-cec8-50f9-b78b-d3e165a78520")
+"""StatsSideChannel."""
 
 _ENGINE_SETTINGS = ("screen size", "quality level", "time scale", "target frame rate", "capture frame rate")
+_said_unknown: set[uuid.UUID] = set()
+
+logger = logging.getLogger(__name__)
+
+
+class TrainerChannels(SideChannelManager):
+    """The trainer's end of the channels; a message on another one is said once, and passed over.
+
+    Args:
+        parameters: environment parameters, sent with the first message.
+        settings: of the engine, likewise; see `EngineConfigurationChannel.set_configuration_parameters`.
+        more: further channels.
+        seed: the player's.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Value],
+        settings: Mapping[str, Any],
+        more: Sequence[SideChannel],
+        seed: int,
+    ) -> None:
+        self.parameters, self._statistics = ParametersChannel(), StatsSideChannel()
+        self.engine = EngineConfigurationChannel()
+        self.engine.set_configuration_parameters(**settings)
+        for name, value in parameters.items():
+            self.parameters.send(name, value, seed)
+        super().__init__([self.parameters, self.engine, self._statistics, *more])
+
+    def pop_statistics(self) -> Statistics:
+        """Return what the game reported of itself (StatsRecorder) since the last call."""
+        reported = self._statistics.get_and_reset_stats()
+        return {
+            name: [(value, AGGREGATIONS[method.value]) for value, method in values]
+            for name, values in reported.items()
+        }
+
+    def process_side_channel_message(self, data: bytes) -> None:
+        """Hand the messages packed in `data` to their channels; raises ValueError for broken ones."""
+        for channel, message in split(data):
+            if channel in self._side_channels_dict:
+                self._side_channels_dict[channel].on_message_received(message)
+            elif channel != ANALYTICS and channel not in _said_unknown:
+                _said_unknown.add(channel)
+                logger.warning(
+                    "the game sends messages on the side channel %s, which the trainer does not know: they "
+                    "are passed over (said once)",
+                    channel,
+                )
 
 
 def split(data: bytes) -> Iterator[tuple[uuid.UUID, IncomingMessage]]:
@@ -92,3 +148,17 @@ def read_engine_setting(message: IncomingMessage) -> str:
 
     name = _ENGINE_SETTINGS[kind] if kind < len(_ENGINE_SETTINGS) else f"setting {kind}"
     return f"{name} {value}"
+
+
+def statistics_messages(statistics: Statistics) -> bytes:
+    """Return the messages that report statistics: each value by itself, as StatsSideChannel.cs does."""
+    out = bytearray()
+    for name, values in statistics.items():
+        for value, method in values:
+            message = OutgoingMessage()
+            # like Unity, which knows ASCII only here
+            message.write_string(name.encode("ascii", "replace").decode())
+            message.write_float32(value)
+            message.write_int32(AGGREGATIONS.index(method))
+            out += STATISTICS.bytes_le + struct.pack("<i", len(message.buffer)) + message.buffer
+    return bytes(out)

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
 
 from mappo_unity.config.extras import install_command
@@ -28,6 +29,9 @@ from mappo_unity.runs.progress import Progress, current_job
 
 if TYPE_CHECKING:
     from torchrl.record.loggers.common import Logger
+
+_BINS = {"TensorboardLogger": "tensorflow", "WandbLogger": 64}
+"""Of histograms, for the loggers that take them: those that the packages take by themselves."""
 
 __all__ = ["RunLog", "check_loggers", "read_metrics"]
 
@@ -88,8 +92,10 @@ class RunLog:
         # After `keep_until`: they append to the files that it trims.
         self._loggers = [_make_logger(backend, cfg, folder) for backend in dict.fromkeys(cfg.loggers)]
 
-    def log(self, row: Mapping[str, Any]) -> None:
+    def log(self, row: Mapping[str, Any], histograms: Mapping[str, np.ndarray] | None = None) -> None:
         """Record a row: numbers by name, with ``agent_steps``; NaN (no episode yet) goes to the CSV only.
+
+        Values of `histograms` go to TensorBoard and W&B, as NAME_hist.
 
         When this returns the row outlives a kill of the process, in ``metrics.csv`` and in the event files.
         Raises ConfigError where it cannot be written.
@@ -97,14 +103,14 @@ class RunLog:
         numbers_by_name = {name: _plain(value) for name, value in row.items()}
 
         try:
-            self._write(numbers_by_name)
+            self._write(numbers_by_name, histograms or {})
         except OSError as error:
             raise ConfigError(self._explain(error)) from error
 
         if self._progress is not None:
             self._progress.update(numbers_by_name)
 
-    def _write(self, row: Mapping[str, int | float]) -> None:
+    def _write(self, row: Mapping[str, int | float], histograms: Mapping[str, np.ndarray]) -> None:
         if not self._folder.is_dir():  # an open file could be written to all the same, and is lost
             raise FileNotFoundError(self._folder)
 
@@ -115,6 +121,9 @@ class RunLog:
 
         for logger in self._loggers:
             logger.log_metrics(curves, step=step)
+            bins = _BINS.get(type(logger).__name__)
+            for name, values in histograms.items() if bins else ():
+                logger.log_histogram(f"{name}_hist", values, step=step, bins=bins)
             logger.flush()
 
     def _explain(self, error: OSError) -> str:

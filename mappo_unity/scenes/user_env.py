@@ -39,7 +39,7 @@ class GuardedEnv(BaseEnv):
 
         # Not methods of this class: hasattr must say what the user's environment has.
         value = getattr(self._env, attribute)
-        if attribute in ("get_state", "set_state", "set_parameter"):
+        if attribute in ("get_state", "set_state", "set_parameter", "pop_statistics"):
             return lambda *arguments: self._call(attribute, value, *arguments)
 
         return value

@@ -14,6 +14,7 @@ from mappo_unity import keys
 from mappo_unity.config.schema import CollectConfig
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.scenes.contract.statistics import Statistics
 from mappo_unity.training.crashed_episodes import mask_crashed_episodes
 
 
@@ -27,6 +28,7 @@ class Batch:
         episodes: those that finished, for each behavior.
         void: by policy name bool ``[..., A, 1]``, slots whose episode a crash cut off that had begun before
             the batch: what is pending of them teaches nothing.
+        statistics: what the environment reported of itself, see `UnityEnv.pop_statistics`.
         restarts: how often players have been started again so far; None: there are no players.
         dropped_episodes, dropped_steps: what crashes cost in this batch.
     """
@@ -35,6 +37,7 @@ class Batch:
     following: dict[str, TensorDictBase]
     episodes: dict[str, list[Episode]]
     void: dict[str, Tensor] = field(default_factory=dict)
+    statistics: Statistics = field(default_factory=dict)
     restarts: int | None = None
     dropped_episodes: int = 0
     dropped_steps: int = 0
@@ -97,7 +100,8 @@ class BatchCollector:
         # only tensors know the device: a collector on the CPU clears that of its batches
         device = rounds.get((next(iter(env.sides)), keys.ACTING)).device
         following = {name: part.to(device) for name, part in following.items()}
-        batch = Batch(rounds, following, env.pop_episodes(), restarts=env.restarts)
+        statistics = env.pop_statistics()
+        batch = Batch(rounds, following, env.pop_episodes(), statistics=statistics, restarts=env.restarts)
         if env.restarts is None:
             return batch
 

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mappo_unity.config.compose import check_effect, compose_config
-from mappo_unity.config.overrides import last_value
+from mappo_unity.config.overrides import given_options, last_value
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.first_checks import check_environment
 from mappo_unity.policies.policy_files import check_resumable
+from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.runs import folder as runs
 from mappo_unity.runs.lock import locked
 from mappo_unity.runs.options import compose_resumed
@@ -66,6 +67,7 @@ def launch(
         raise ConfigError("resume= is empty: it must name a run folder or a checkpoint file")
 
     if resume is not None:
+        _refuse_both(lines)
         return _resume(lines, Path(str(resume)), warn, show)
     return _train_new(lines, file, warn, show)
 
@@ -82,17 +84,27 @@ def _train_new(lines: list[str], file: Path | None, warn: Warn, show: _Show) -> 
     with interrupts_wait():
         composed = compose_config(lines, file=file)
         check_effect(lines, [composed.config])
-        check_environment(composed.config)
+        config = adopt_file_options(composed.config, lines, file)
+        check_environment(config)
 
     folder = runs.create_folder(composed.run_dir, exact=last_value(lines, "hydra.run.dir") is not None)
     try:
         with _locked(folder.path, warn):
             typed = lines if file is None else [f"--config={file}", *lines]
-            runs.write_record(folder.path, composed.config, typed)
-            return Launched(folder.path, _train(composed.config, folder.path, None, show))
+            runs.write_record(folder.path, config, typed)
+            return Launched(folder.path, _train(config, folder.path, None, show))
     except (ConfigError, KeyboardInterrupt) as error:
         runs.discard_folder(folder, error)
         raise
+
+
+def _refuse_both(lines: list[str]) -> None:
+    starts = [name for name in given_options(lines) if name.rpartition(".")[2] == "init_from"]
+    if starts:
+        raise ConfigError(
+            f"{starts[0]} does not go with resume: a resumed run goes on with its own networks; leave one of "
+            "the two out"
+        )
 
 
 def _resume(lines: list[str], path: Path, warn: Warn, show: _Show) -> Launched:

@@ -19,6 +19,7 @@ from mappo_unity.config.presets import group_choices
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.first_checks import check_environment
+from mappo_unity.policies.warm_start.sources import adopt_file_options
 
 MANY = 200  # jobs whose check takes so long that it is announced
 _COUNTS = {"hydra.sweeper.n_trials": 1, "hydra.sweeper.n_jobs": 1, "hydra.sweeper.max_batch_size": 1}
@@ -62,6 +63,8 @@ def plan_jobs(
     _check_plugins(first.tree)
     configs = _configs(jobs, hydra, file, first)
 
+    for job, config in zip(jobs, configs):
+        adopt_file_options(config, job, file)
     # Jobs mostly share their environment: it is looked at once for each factory.
     for config in {config.env.factory: config for config in configs}.values():
         check_environment(config)

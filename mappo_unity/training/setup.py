@@ -17,7 +17,7 @@ from mlagents_envs.base_env import BehaviorSpec, ObservationSpec
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType
 
-from mappo_unity.config.per_behavior import behavior_config, check_behaviors
+from mappo_unity.config.per_behavior import TRAIN, behavior_config, check_behaviors, is_frozen
 from mappo_unity.config.schema import CollectConfig, Config, CriticKind, PPOConfig
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.envs.following import followed
@@ -49,7 +49,8 @@ class TrainingSetup:
         env: the environment, open.
 
     Attributes: `learners` by policy name; `policy`, their actors as one; `lessons` of environment parameters;
-    `notes`, lines for the user; `guesses_channels`, whether `guess_channels` built the networks.
+    `notes`, lines for the user; `frozen`, the policy names that only play; `guesses_channels`, whether
+    `guess_channels` built the networks.
 
     Raises:
         ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
@@ -63,6 +64,12 @@ class TrainingSetup:
 
         self.guesses_channels = False
         self._make_learners(self.notes.append)
+        self.frozen = {name for name in self.learners if is_frozen(cfg, name)}
+        if len(self.frozen) == len(self.learners):
+            raise ConfigError(
+                f"behaviors.{next(iter(self.frozen))}.{TRAIN}=false: nothing is learnt, since every behavior "
+                "of the environment is frozen; mappo-eval plays without learning"
+            )
 
     def guess_channels(self) -> None:
         """Build the networks again as older versions did: an image's smaller dimension holds its channels."""
@@ -95,11 +102,14 @@ class TrainingSetup:
         """
         # Large minibatches gain from threads; small networks, while collecting, do not.
         torch.set_num_threads(min(self.cfg.update_threads, os.cpu_count() or 1))
-        metrics = {}
+        metrics: dict[str, dict[str, float]] = {}
         for name, learner in self.learners.items():
             if name in batch.void:
                 learner.carried.void(batch.void[name])
-            metrics[name] = learner.learn(*batch.of(name), progress)
+            if name not in self.frozen:
+                metrics[name] = learner.learn(*batch.of(name), progress)
+            if self.frozen:
+                metrics.setdefault(name, {})["frozen"] = float(name in self.frozen)
         torch.set_num_threads(self.cfg.num_threads)
         return metrics
 

@@ -29,6 +29,7 @@ from mappo_unity.config.presets import conf_dir
 from mappo_unity.config.schema import Config
 from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
+from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.folder import NewFolder, create_folder, discard_folder, write_record
 from mappo_unity.runs.lock import locked
@@ -134,7 +135,8 @@ def _run_job(tree: DictConfig) -> float | None:
 
     try:
         with locked(folder):
-            ended_by = _train(to_config(tree), folder, result)
+            config = adopt_file_options(to_config(tree), result.overrides)
+            ended_by = _train(config, folder, result)
     except KeyboardInterrupt as error:
         result.status = "interrupted"
         ended_by = getattr(error, "signal", int(signal.SIGINT))

@@ -14,14 +14,17 @@ from pathlib import Path
 from rich.console import Console
 
 from mappo_unity.config.schema import Config
+from mappo_unity.envs.statistics import with_statistics
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
+from mappo_unity.policies.warm_start.start import warm_start
 from mappo_unity.runs.logger import RunLog
 from mappo_unity.signals import Interrupted
 from mappo_unity.training.batches import BatchCollector
 from mappo_unity.training.episode_stats import by_policy
 from mappo_unity.training.memory import is_out_of_memory
 from mappo_unity.training.outcome import DIVERGED, FINISHED, INTERRUPTED, SOLVED, Outcome, why_over
+from mappo_unity.training.resume_check import describe_policies
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.saver import CheckpointSaver
 from mappo_unity.training.setup import set_up
@@ -60,12 +63,13 @@ def train(
         state = RunState(cfg, folder, setup)
         if resume_from is not None:
             state.load(resume_from)
+        started = warm_start(cfg, setup.learners, describe_policies(setup.env)) if resume_from is None else []
 
         resume_steps = state.agent_steps if resume_from is not None else None
         with RunLog(cfg.log, folder, cfg.max_steps, resume_steps, console) as log:
             # not before: until here something may be refused
             log.message(f"run folder: {folder}" if resume_from is None else f"resuming from {resume_from}")
-            for note in setup.notes:
+            for note in setup.notes + started:
                 log.message(note)
             exports = RunExports(folder, log.message) if cfg.export_onnx else None
             saver = CheckpointSaver(cfg, folder, state, exports, resume_from)
@@ -120,7 +124,7 @@ def _iterate(
             series = state.play_matches()
             saver.complete_matches()
         finally:  # a series that fails costs no row
-            log.log(row | series)
+            log.log(*with_statistics(row | series, batch.statistics))
         if series:
             log.message(state.matches.said)
 

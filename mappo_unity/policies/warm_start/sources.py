@@ -1,0 +1,119 @@
+"""What init_from names, and the model options that an ONNX file brings; known without torch."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from mappo_unity.config.option_table import show_value
+from mappo_unity.config.options_file import file_root
+from mappo_unity.config.overrides import given_options
+from mappo_unity.config.schema import Config, ModelConfig
+from mappo_unity.errors import ConfigError
+from mappo_unity.policies.policy_files import Kind, Source, check_checkpoint, locate
+from mappo_unity.policies.warm_start.onnx_network import read_network
+
+STARTS = "a run folder, a checkpoint (.pt) or an ONNX file"
+
+
+def find_source(where: str, option: str) -> Source:
+    """Return what an `init_from` names.
+
+    Raises:
+        ConfigError: nothing is there, or nothing that networks could begin with.
+    """
+    source = locate(where, option, STARTS)
+    if source.kind is Kind.random:
+        raise ConfigError(
+            f"{option}=random: without {option} networks begin with random weights; give {STARTS}"
+        )
+    if source.kind is Kind.onnx_folder:
+        raise ConfigError(
+            f"{option}={where} is a folder of ONNX files: give each behavior its own, "
+            "behaviors.NAME.init_from=FOLDER/NAME.onnx"
+        )
+    return source
+
+
+def adopt_file_options(config: Config, lines: list[str], file: Path | None = None) -> Config:
+    """Return options whose networks have the shape of the ONNX files that they begin with.
+
+    Args:
+        config: the composed options; preset and recipe give way to the file.
+        lines, file: what the user gave, which is not overruled.
+
+    Raises:
+        ConfigError: a given option contradicts a file, or there is no such file or checkpoint.
+    """
+    given = {name.removeprefix("model.") for name in given_options(lines) if name.startswith("model.")}
+    if file is not None:
+        given |= set(file_root(file, lines).get("model") or {})
+
+    behaviors = copy.deepcopy(config.behaviors)
+    shape = _shape_of(config.init_from, "init_from")
+    model = _adopted(config.model, shape, given, "model", str(config.init_from))
+
+    for name, own in behaviors.items():
+        if not isinstance(own, dict) or not isinstance(own.get("model") or {}, dict):
+            continue  # `behavior_config` says what is wrong with it
+        option = f"behaviors.{name}"
+        theirs = dict(own.get("model") or {})
+        if "init_from" in own:
+            # what the file of the other behaviors changed is not meant for this one
+            back = {key: _plain(getattr(config.model, key)) for key in shape if key not in theirs}
+            shape_of_own = _shape_of(own["init_from"], f"{option}.init_from")
+            _check_given(theirs, shape_of_own, f"{option}.model", str(own["init_from"]))
+            if shape or shape_of_own:
+                own["model"] = back | theirs | shape_of_own
+        else:
+            _check_given(theirs, shape, f"{option}.model", str(config.init_from))
+
+    return replace(config, model=model, behaviors=behaviors)
+
+
+def _shape_of(where: Any, option: str) -> dict[str, Any]:
+    """Return the model options of an ONNX file; none of a checkpoint, which is only looked for."""
+    if where is None:
+        return {}
+    if not isinstance(where, str) or not where:
+        raise ConfigError(f"{option}={where!r} must name {STARTS}, or be null")
+
+    source = find_source(where, option)
+    if source.kind is Kind.onnx:
+        return read_network(source.path).options
+    check_checkpoint(source)
+    return {}
+
+
+def _adopted(
+    model: ModelConfig, shape: dict[str, Any], given: Collection[str], where: str, path: str
+) -> ModelConfig:
+    changed = {key: value for key, value in shape.items() if _plain(getattr(model, key)) != value}
+    _check_given({key: _plain(getattr(model, key)) for key in given if key in shape}, shape, where, path)
+    if not shape:
+        return model
+    try:
+        merged = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(model), changed))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    assert isinstance(merged, ModelConfig)
+    return merged
+
+
+def _check_given(given: dict[str, Any], shape: dict[str, Any], where: str, path: str) -> None:
+    for key, value in given.items():
+        if key in shape and _plain(value) != shape[key]:
+            raise ConfigError(
+                f"{where}.{key}={show_value(_plain(value))} contradicts {path}, whose network has "
+                f"{key}={show_value(shape[key])}: leave the option out, and it is taken from the file"
+            )
+
+
+def _plain(value: Any) -> Any:
+    value = getattr(value, "value", value)
+    return list(value) if isinstance(value, (list, tuple)) else value

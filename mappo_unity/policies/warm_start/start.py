@@ -1,0 +1,119 @@
+"""A warm start: what learners begin with instead of drawn weights, and the lines that say so.
+
+Only networks are copied: steps, optimizer, schedules and episodes begin anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mappo_unity.config.option_table import show_value
+from mappo_unity.config.per_behavior import init_source
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
+from mappo_unity.learning.networks.actor_critic import PerMember
+from mappo_unity.learning.ppo import PolicyLearner
+from mappo_unity.learning.value_norm import by_stream
+from mappo_unity.policies.policy_files import Kind, choose_checkpoint
+from mappo_unity.policies.warm_start.agreement import check_agreement
+from mappo_unity.policies.warm_start.from_onnx import actor_tensors
+from mappo_unity.policies.warm_start.onnx_network import read_network
+from mappo_unity.policies.warm_start.sources import find_source
+from mappo_unity.policies.warm_start.tensors import Row, copy_fitting, table
+from mappo_unity.runs import checkpoint
+
+NETWORK = "module.0.module."  # names of an actor's network in the actor's state_dict
+
+
+def warm_start(
+    cfg: Config, learners: Mapping[str, PolicyLearner], layouts: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
+    """Copy tensors into the learners of all behaviors that have an `init_from`; return lines for the user.
+
+    Args:
+        cfg: the run's options.
+        learners: by policy name, new.
+        layouts: what each was built for, as `describe_spec` returns it.
+
+    Raises:
+        ConfigError: nothing fits, or an ONNX file cannot be read as a network of ours.
+    """
+    lines: list[str] = []
+    for name, learner in learners.items():
+        option, where = init_source(cfg, name)
+        if where is None:
+            continue
+
+        source = find_source(where, option)
+        try:
+            if source.kind is Kind.onnx:
+                told, rows = _from_onnx(source.path, learner, layouts[name])
+            else:
+                told, rows = _from_checkpoint(choose_checkpoint(source.path, option), name, learner)
+        except ConfigError as error:
+            raise ConfigError(f"{option}: {error}") from error
+
+        if all(row.reason for row in rows):
+            mistake = ConfigError(
+                f"{option}={where}: nothing of it fits the networks of {name}; "
+                f"behaviors.{name}.init_from=null starts {name} anew"
+            )
+            mistake.details = tuple(table(rows))
+            raise mistake
+        lines += [f"{name} begins with {told}:", *table(rows)]
+    return lines
+
+
+def _from_onnx(path: Path, learner: PolicyLearner, layout: Mapping[str, Any]) -> tuple[str, list[Row]]:
+    network = read_network(path)
+    net: Any = learner.actor[0].module
+    # a network for each member of a team: all of them begin alike
+    members = (
+        {f"nets.{i}.": member for i, member in enumerate(net.nets)} if isinstance(net, PerMember) else {}
+    )
+
+    tensors: dict[str, torch.Tensor] = {}
+    misfits: dict[str, str] = {}
+    for prefix, member in (members or {"": net}).items():
+        own, why = actor_tensors(network, member, layout["sensors"])
+        tensors |= {NETWORK + prefix + n: torch.tensor(values) for n, values in own.items()}
+        misfits |= {NETWORK + prefix + n: reason for n, reason in why.items()}
+
+    rows = copy_fitting(learner.actor, "actor", tensors, misfits)
+    told = f"{path}, whose network has {_show(network.options)}"
+    if not any(row.reason for row in rows):
+        error = max(check_agreement(network, m, layout["sensors"]) for m in (members or {"": net}).values())
+        told += f"; on random observations its actions differ from onnxruntime's by {error:.1e}"
+    return told, [*rows, Row("critic", None, "an ONNX file holds none: a new one learns")]
+
+
+def _show(options: Mapping[str, Any]) -> str:
+    return " ".join(f"{name}={show_value(value)}" for name, value in options.items())
+
+
+def _from_checkpoint(path: Path, name: str, learner: PolicyLearner) -> tuple[str, list[Row]]:
+    state = checkpoint.load(path)
+    known = list(state["learners"])
+    if name not in known and len(known) > 1:
+        raise ConfigError(
+            f"{path} holds policies {', '.join(known)}, none called {name}; "
+            f"behaviors.{name}.init_from=null starts {name} anew"
+        )
+
+    theirs = name if name in known else known[0]
+    saved = state["learners"][theirs]
+    rows = copy_fitting(learner.actor, "actor", saved["actor"], {})
+    critic = copy_fitting(learner.critic, "critic", saved["critic"], {})
+
+    # the values of a critic are in the scale of the statistics under which it learnt
+    whole = not any(row.reason for row in critic)
+    statistics = by_stream(saved["value_norm"]) if whole else {}
+    norm = copy_fitting(
+        learner.value_norm, "value_norm", statistics, {"": "it is of use to the whole critic only"}
+    )
+    told = f"{path}" + (f", policy {theirs}" if theirs != name else "")
+    return f"{told} ({int(state['agent_steps']):,} agent steps)", [*rows, *critic, *norm]
