@@ -337,12 +337,17 @@ class PPOConfig:
     """Clip the gradients of actor and critic apart, as two optimizers would; false: one norm over both."""
     optimizer: Optimizer = Optimizer.adam
     """Optimizer of the networks."""
+    optimizer_eps: float = 1e-5
+    """Epsilon of the optimizer, which keeps steps small where gradients are tiny."""
     weight_decay: float = 0.0
     """Weight decay of the optimizer."""
     gamma: float = 0.99
     """Discount of a decision."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation."""
+    time_horizon: Optional[int] = None
+    """Decisions of an agent after which its advantages are cut, and a value stands for the rest (as in
+    ML-Agents); null: they are cut only where a batch ends."""
     clip_epsilon: float = 0.2
     """Half-width of the ratio's clipping interval at the start."""
     clip_schedule: Schedule = Schedule.constant
@@ -403,9 +408,11 @@ class PPOConfig:
         _above("ppo.critic_lr", self.critic_lr, 0)
         _at_least("ppo.sequence_length", self.sequence_length, 1)
         _at_least("ppo.lr_final", self.lr_final, 0)
+        _above("ppo.optimizer_eps", self.optimizer_eps, 0)
         _at_least("ppo.weight_decay", self.weight_decay, 0)
         _within("ppo.gamma", self.gamma, 0, 1)
         _within("ppo.gae_lambda", self.gae_lambda, 0, 1)
+        _at_least("ppo.time_horizon", self.time_horizon, 1)
         _between("ppo.clip_epsilon", self.clip_epsilon, 0, 1)
         _between("ppo.clip_epsilon_final", self.clip_epsilon_final, 0, 1)
 

@@ -117,6 +117,7 @@ class PolicyLearner:
             rounds.get(keys.TRUNCATED),
             gamma=self.cfg.gamma,
             gae_lambda=self.cfg.gae_lambda,
+            horizon=self.cfg.time_horizon,
         )
         self.carried.keep(rounds, view)
         self.reader.keep(values, rounds.get(VALUED) & ~gae.known)
