@@ -95,6 +95,13 @@ class ValueNormUpdate(Enum):
     minibatch = "minibatch"
 
 
+class ObsNormUpdate(Enum):
+    """When the statistics of observations move."""
+
+    batch = "batch"
+    round = "round"
+
+
 class WeightInit(Enum):
     """Initial weights of linear layers; biases are 0."""
 
@@ -388,6 +395,9 @@ class PPOConfig:
     """Decay, for each batch, of the running statistics of returns."""
     value_norm_update: ValueNormUpdate = ValueNormUpdate.batch
     """When these statistics move: once for each batch, or with each minibatch (the MAPPO paper's code)."""
+    obs_norm_update: ObsNormUpdate = ObsNormUpdate.batch
+    """With model.normalize_obs: when its statistics move, once for each batch, after its update (batch), or
+    while it is collected, with each round (round: ML-Agents moves them with each trajectory)."""
     reward_weight: float = 1.0
     """Weight of an agent's individual reward."""
     group_reward_weight: float = 1.0

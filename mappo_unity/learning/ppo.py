@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from mappo_unity import keys
-from mappo_unity.config.schema import PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
+from mappo_unity.config.schema import ObsNormUpdate, PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
 from mappo_unity.learning.advantage import (
     Advantage,
     estimate,
@@ -30,7 +30,7 @@ from mappo_unity.learning.carried import VALUED, CarriedRounds, has_value
 from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS, MaskedClipPPOLoss
 from mappo_unity.learning.minibatches import make_buffer
 from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
-from mappo_unity.learning.networks.encoders import RunningNorm
+from mappo_unity.learning.networks.encoders import running_norms, update_norms
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.optimizer import clip_gradients, in_two_groups, make_optimizer
 from mappo_unity.learning.rows import make_rows
@@ -64,7 +64,10 @@ class PolicyLearner:
 
         self.value_layers = value_layers(critic)  # which PopArt rescales
         self.bounded = [m for m in actor.modules() if isinstance(m, Actor)]
-        self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
+        actor_norms, critic_norms = running_norms(actor), running_norms(critic)
+        self.norms = [*actor_norms, *critic_norms]
+        if cfg.obs_norm_update is ObsNormUpdate.round:
+            actor.moving_norms = actor_norms
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
 
     def learn(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
@@ -78,9 +81,13 @@ class PolicyLearner:
             Metrics.
         """
         settings = self._set_schedules(progress)
+        for norm in self.norms if self.actor.moving_norms else ():
+            norm.load_state_dict(self.actor.moving_norms[0].state_dict())  # the critic's follow
+
         buffer, metrics = self.prepare(batch)
         metrics |= self.update(buffer) if buffer is not None else {}
-        self._update_norms(batch)
+        if not self.actor.moving_norms:
+            update_norms(self.norms, batch)  # after the update, which must not see it
         return metrics | settings
 
     def _set_schedules(self, progress: float) -> dict[str, float]:
@@ -253,14 +260,6 @@ class PolicyLearner:
             if key in minibatch.keys():
                 minibatch.set(key, self.value_norm.normalize(minibatch.get(key)))
 
-    @torch.no_grad()
-    def _update_norms(self, batch: TensorDictBase) -> None:
-        """Take the batch's observations into the normalisers, after the update that must not see it."""
-        if self.norms:
-            rows = batch.get(keys.OBS)[batch.get(keys.ACTING).squeeze(-1)]
-            for norm in self.norms:
-                norm.update(rows)
-
     def _weights_finite(self) -> bool:
         return all(bool(torch.isfinite(p).all()) for p in self.params)
 
@@ -278,7 +277,10 @@ class PolicyLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that resuming needs."""
-        return self._trainable_state() | {
+        state = self._trainable_state()
+        if self.actor.moving_norms:  # on, while what is returned here has not been written yet
+            state["actor"] = {name: value.clone() for name, value in state["actor"].items()}
+        return state | {
             "value_norm": self.value_norm.state_dict(),
             "carried": self.carried.state_dict(),
             "critic_states": self.reader.state_dict(),
