@@ -32,7 +32,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 TRAINERS = "mlagents-learn", "mappo-unity"
 COLORS = "tab:orange", "tab:blue"
-BINS = 30  # points of a curve
+BINS = 12  # points of a curve
 LAST = 0.1  # share of a run whose episodes make its last return
 
 
@@ -255,7 +255,7 @@ def table(out: Path) -> str:
     lines = ["| scene | decisions | seed | last return: " + " | ".join(TRAINERS) + " | s: "]
     lines[0] += " | ".join(TRAINERS) + " | load |"
     lines.append("|---" * 8 + "|")
-    for scene, seed in dict.fromkeys((scene, seed) for scene, seed, _ in rows):
+    for scene, seed in sorted({(scene, seed) for scene, seed, _ in rows}):
         both = [rows.get((scene, seed, trainer)) for trainer in TRAINERS]
         limits = "/".join(dict.fromkeys(f"{int(row['limit']):,}" for row in both if row))
         loads = [float(row[name]) for row in both if row for name in ("load_before", "load_after")]
@@ -274,8 +274,8 @@ def draw(curves: Curves, path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    scenes = list(dict.fromkeys(scene for scene, _, _ in curves))
-    figure, axes = pyplot.subplots(2, 2, figsize=(10, 7), layout="constrained")
+    scenes = sorted({scene for scene, _, _ in curves})
+    figure, axes = pyplot.subplots(2, 2, figsize=(9, 6), layout="constrained")
     for axis, scene in zip(axes.flat, scenes):
         for trainer, color in zip(TRAINERS, COLORS):
             of_seeds = [dict(points) for (s, t, _), points in curves.items() if (s, t) == (scene, trainer)]
@@ -289,7 +289,7 @@ def draw(curves: Curves, path: Path) -> None:
         axis.legend()
     for axis in axes.flat[len(scenes) :]:
         axis.remove()
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, dpi=80)
 
 
 if __name__ == "__main__":

@@ -47,8 +47,8 @@ def test_curves_and_table(tmp_path):
     write(tmp_path, "mlagents-learn", 0, [(5, 1, 0), (9, 2, 1), (150, 4, 0), (300, 9, 9)])
     write(tmp_path, "mappo-unity", 0, [(280, 1, 0), (295, 2, 0)])
     curves = bench_peer.write_curves(tmp_path, tmp_path / "peer.csv")
-    assert curves["Basic", "mlagents-learn", 0] == [(10, 2.0), (160, 4.0)]  # 30 points of 10 decisions
-    assert (tmp_path / "peer.csv").read_text().splitlines()[1] == "Basic,mlagents-learn,0,10,2"
+    assert curves["Basic", "mlagents-learn", 0] == [(25, 2.0), (175, 4.0)]  # 12 points of 25 decisions
+    assert (tmp_path / "peer.csv").read_text().splitlines()[1] == "Basic,mlagents-learn,0,25,2"
     assert bench_peer.last_return(tmp_path / "mappo-unity-0", 300) == 1.5
     assert (
         bench_peer.table(tmp_path).splitlines()[2] == "| Basic | 300 | 0 | 1.5 | 1.5 | 7 | 7 | 1.0 to 2.0 |"
