@@ -266,11 +266,11 @@ def test_the_command_line_takes_them():
     assert model.action_distribution is DistributionKind.tanh_normal
 
 
-def test_statistics_can_move_while_a_batch_is_collected(tmp_path):
+def test_statistics_and_schedules_can_move_before_a_batch_is_learnt(tmp_path):
     """As ML-Agents': the first update sees observations that are normalised already."""
     lines = ["recipe=mlagents", "env=3DBall", "env.num_areas=4", "model.hidden=[8]", "collect.rounds=16"]
     cfg = compose_config([*lines, "max_steps=256", "log.loggers=[]", "log.progress=false"]).config
-    counts, states = [], []
+    counts, states, rates = [], [], []
 
     def look(state):
         learner = state.setup.learners["3DBall"]
@@ -278,6 +278,7 @@ def test_statistics_can_move_while_a_batch_is_collected(tmp_path):
         counts.append((state.agent_steps, float(of_actor.count)))
         assert torch.equal(of_actor.mean, of_critic.mean) and not torch.equal(of_actor.var, torch.ones(8))
         states.append(learner.state_dict()["actor"])
+        rates.append(learner.optimizer.param_groups[0]["lr"])
         return None
 
     whole = train(cfg, tmp_path / "whole", after_iteration=look)
@@ -288,6 +289,9 @@ def test_statistics_can_move_while_a_batch_is_collected(tmp_path):
         193,
         257,
     ]
+
+    # and the schedules count the batch that is learnt: the last one is learnt with their final value
+    assert rates == pytest.approx([2.25e-4, 1.5e-4, 7.5e-5, 1e-10], rel=1e-4)
 
     stop = lambda state: "interrupted" if state.iteration == 2 else None  # noqa: E731
     half = train(cfg, tmp_path / "parts", after_iteration=stop).last_checkpoint

@@ -82,7 +82,7 @@ def check(ours, theirs, behaviors=1):
     assert (ppo.clip_epsilon, ppo.clip_schedule) == (hyper["epsilon"], schedule)
     assert (ppo.entropy_coef, ppo.entropy_schedule) == (hyper["beta"], schedule)
     assert (ppo.gae_lambda, ppo.epochs) == (hyper["lambd"], hyper["num_epoch"])
-    assert ppo.obs_norm_update is ObsNormUpdate.round
+    assert ppo.obs_norm_update is ObsNormUpdate.round and ppo.schedules_count_batch
     assert ppo.time_horizon == theirs["time_horizon"]
     assert ppo.minibatch_size == hyper["batch_size"] and ppo.num_minibatches is None
     assert ours.collect.batch_size == behaviors * hyper["buffer_size"] and ours.collect.rounds is None

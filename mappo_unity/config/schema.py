@@ -338,6 +338,9 @@ class PPOConfig:
     """How the learning rate falls to ppo.lr_final over max_steps."""
     lr_final: float = 0.0
     """Learning rate at the end of its schedule."""
+    schedules_count_batch: bool = False
+    """Whether schedules count the decisions of the batch that is learnt, so that the last one is learnt with
+    the final values (as ML-Agents), or only those before it."""
     critic_lr: Optional[float] = None
     """Learning rate of the critic at the start, with the schedule of ppo.lr; null: as ppo.lr."""
     separate_optimizers: bool = False

@@ -31,7 +31,7 @@ from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.scenes.contract.images import looks_unmarked
-from mappo_unity.training.batches import Batch, BatchCollector, count_present
+from mappo_unity.training.batches import Batch, BatchCollector, count_decisions, count_present
 from mappo_unity.training.memory import check_free, show_size
 
 BATCH_COPIES = 6
@@ -88,15 +88,17 @@ class TrainingSetup:
 
         Args:
             batch: as collected.
-            progress: share of the run that is over, 0 to 1, for the schedules.
+            progress: share of the run that was over when the batch began, 0 to 1, for the schedules.
         """
+        share = count_decisions(batch.rounds, self.learners) / self.cfg.max_steps
         # Large minibatches gain from threads; small networks, while collecting, do not.
         torch.set_num_threads(min(self.cfg.update_threads, os.cpu_count() or 1))
         metrics = {}
         for name, learner in self.learners.items():
             if name in batch.void:
                 learner.carried.void(batch.void[name])
-            metrics[name] = learner.learn(batch.of(name), progress)
+            ahead = share if learner.cfg.schedules_count_batch else 0.0
+            metrics[name] = learner.learn(batch.of(name), progress + ahead)
         torch.set_num_threads(self.cfg.num_threads)
         return metrics
 
