@@ -280,7 +280,9 @@ def draw(curves: Curves, path: Path) -> None:
         for trainer, color in zip(TRAINERS, COLORS):
             of_seeds = [dict(points) for (s, t, _), points in curves.items() if (s, t) == (scene, trainer)]
             for points in of_seeds:
-                axis.plot(list(points), list(points.values()), color=color, linewidth=0.7, alpha=0.6)
+                axis.plot(
+                    list(points), list(points.values()), color=color, marker=".", linewidth=0.7, alpha=0.6
+                )
             common = sorted(set.intersection(*map(set, of_seeds))) if of_seeds else []
             mean = [statistics.mean(points[at] for points in of_seeds) for at in common]
             axis.plot(common, mean, color=color, linewidth=2, label=f"{trainer} ({len(of_seeds)} seeds)")
