@@ -22,11 +22,20 @@ def masked_gae(
     *,
     gamma: float,
     gae_lambda: float,
+    horizon: int | None = None,
 ) -> Advantage:
     """Build the decision view of these masks and estimate advantages; shapes as in `estimate`."""
     view = make_view(valued_T, final_valued, terminated_T | truncated_T)
     return estimate(
-        view, reward_T, value_T, end_value_T, final_value, truncated_T, gamma=gamma, gae_lambda=gae_lambda
+        view,
+        reward_T,
+        value_T,
+        end_value_T,
+        final_value,
+        truncated_T,
+        gamma=gamma,
+        gae_lambda=gae_lambda,
+        horizon=horizon,
     )
 
 

@@ -8,9 +8,17 @@ from masked import masked_gae
 from mappo_unity.learning.decisions import DecisionView
 
 
-def brute_force(reward, value, end_value, final_value, valued, final_valued, terminated, truncated, g, lam):
+def brute_force(
+    reward, value, end_value, final_value, valued, final_valued, terminated, truncated, g, lam, horizon=None
+):
     """Return advantages and masks of one slot, walking forward from each decision."""
     rounds = len(reward)
+    place, cut = 0, np.zeros(rounds, bool)
+    for t in range(rounds):
+        place += valued[t]
+        cut[t] = horizon is not None and place % horizon == 0
+        place = 0 if terminated[t] or truncated[t] else place
+
     advantage, known = np.zeros(rounds), np.zeros(rounds, bool)
     for t in range(rounds - 1, -1, -1):
         if not valued[t]:
@@ -30,7 +38,8 @@ def brute_force(reward, value, end_value, final_value, valued, final_valued, ter
                 break
             if valued[s]:
                 # a decision without an outcome hands its value back, and no advantage
-                advantage[t] = total + g * value[s] - value[t] + g * lam * advantage[s]
+                onward = 0.0 if cut[t] else g * lam * advantage[s]
+                advantage[t] = total + g * value[s] - value[t] + onward
                 known[t] = True
                 break
     return advantage, known
@@ -49,12 +58,13 @@ def test_a_hundred_random_cases(part):
         terminated = rng.random(shape) < 0.15 * rng.random()
         truncated = (rng.random(shape) < 0.15 * rng.random()) & ~terminated
         g, lam = rng.random(2)
+        horizon = rng.choice([None, 1, 2, 3, 5])
 
         arrays = reward, value, end_value, final_value, valued, final_valued, terminated, truncated
-        out = masked_gae(*map(torch.from_numpy, arrays), gamma=g, gae_lambda=lam)
+        out = masked_gae(*map(torch.from_numpy, arrays), gamma=g, gae_lambda=lam, horizon=horizon)
         for n in range(slots):
             columns = [a[:, n] if a.ndim == 2 else a[n] for a in arrays]
-            advantage, known = brute_force(*columns, g, lam)
+            advantage, known = brute_force(*columns, g, lam, horizon)
             assert out.known[:, n].numpy().tolist() == known.tolist()
             assert np.allclose(out.advantage[:, n], advantage, atol=1e-5)
             assert np.allclose(out.target[:, n], np.where(known, advantage + value[:, n], 0), atol=1e-5)

@@ -264,3 +264,37 @@ def test_the_command_line_takes_them():
     assert model.layer_norm and model.obs_norm_prior
     assert model.weight_init is WeightInit.kaiming_normal
     assert model.action_distribution is DistributionKind.tanh_normal
+
+
+def test_statistics_and_schedules_can_move_before_a_batch_is_learnt(tmp_path):
+    """As ML-Agents': the first update sees observations that are normalised already."""
+    lines = ["recipe=mlagents", "env=3DBall", "env.num_areas=4", "model.hidden=[8]", "collect.rounds=16"]
+    cfg = compose_config([*lines, "max_steps=256", "log.loggers=[]", "log.progress=false"]).config
+    counts, states, rates = [], [], []
+
+    def look(state):
+        learner = state.setup.learners["3DBall"]
+        of_actor, of_critic = learner.norms
+        counts.append((state.agent_steps, float(of_actor.count)))
+        assert torch.equal(of_actor.mean, of_critic.mean) and not torch.equal(of_actor.var, torch.ones(8))
+        states.append(learner.state_dict()["actor"])
+        rates.append(learner.optimizer.param_groups[0]["lr"])
+        return None
+
+    whole = train(cfg, tmp_path / "whole", after_iteration=look)
+    assert counts == [(steps, steps + 1) for steps in (64, 128, 192, 256)]  # 1: the prior
+    assert [float(next(v for k, v in s.items() if k.endswith("count"))) for s in states] == [
+        65,
+        129,
+        193,
+        257,
+    ]
+
+    # and the schedules count the batch that is learnt: the last one is learnt with their final value
+    assert rates == pytest.approx([2.25e-4, 1.5e-4, 7.5e-5, 1e-10], rel=1e-4)
+
+    stop = lambda state: "interrupted" if state.iteration == 2 else None  # noqa: E731
+    half = train(cfg, tmp_path / "parts", after_iteration=stop).last_checkpoint
+    resumed = train(cfg, tmp_path / "parts", half)
+    ends = [checkpoint.load(out.last_checkpoint)["learners"]["3DBall"]["actor"] for out in (whole, resumed)]
+    assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])

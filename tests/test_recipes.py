@@ -13,6 +13,7 @@ from mappo_unity.config.schema import (
     CriticKind,
     DistributionKind,
     MemoryKind,
+    ObsNormUpdate,
     Schedule,
     ValueNormUpdate,
     WeightInit,
@@ -81,6 +82,8 @@ def check(ours, theirs, behaviors=1):
     assert (ppo.clip_epsilon, ppo.clip_schedule) == (hyper["epsilon"], schedule)
     assert (ppo.entropy_coef, ppo.entropy_schedule) == (hyper["beta"], schedule)
     assert (ppo.gae_lambda, ppo.epochs) == (hyper["lambd"], hyper["num_epoch"])
+    assert ppo.obs_norm_update is ObsNormUpdate.round and ppo.schedules_count_batch
+    assert ppo.time_horizon == theirs["time_horizon"]
     assert ppo.minibatch_size == hyper["batch_size"] and ppo.num_minibatches is None
     assert ours.collect.batch_size == behaviors * hyper["buffer_size"] and ours.collect.rounds is None
     assert ppo.gamma == theirs["reward_signals"]["extrinsic"]["gamma"]
@@ -101,7 +104,7 @@ def test_the_official_learner_is_whole_whatever_the_preset_says(scene):
     """What a preset chose for itself must not leak into a recipe: activation, deviation, epochs."""
     config = composed("recipe=mlagents", f"env={scene}")
     bare = composed("recipe=mlagents", "env=unity", "env.file_name=Game")
-    own = {"lr", "gamma", "gae_lambda", "minibatch_size", "entropy_coef", "sequence_length"}
+    own = {"lr", "gamma", "gae_lambda", "time_horizon", "minibatch_size", "entropy_coef", "sequence_length"}
     own |= {f"{name}_schedule" for name in ("lr", "clip", "entropy")}
     ppo, expected = asdict(config.ppo), asdict(bare.ppo)
     assert {k: v for k, v in ppo.items() if k not in own} == {
@@ -127,6 +130,7 @@ def test_what_makes_the_recipes_differ():
     official, paper, benchmarl = (
         composed(f"recipe={name}") for name in ("mlagents", "mappo_paper", "benchmarl")
     )
+    assert [c.ppo.optimizer_eps for c in (official, paper, benchmarl)] == [1e-8, 1e-5, 1e-6]
     assert official.ppo.max_grad_norm is None and not official.ppo.separate_optimizers
     assert official.model.weight_init is WeightInit.kaiming_normal and official.model.obs_norm_prior
     assert paper.model.layer_norm and not paper.model.normalize_obs

@@ -114,6 +114,13 @@ class ValueNormUpdate(Enum):
     minibatch = "minibatch"
 
 
+class ObsNormUpdate(Enum):
+    """When the statistics of observations move."""
+
+    batch = "batch"
+    round = "round"
+
+
 class WeightInit(Enum):
     """Initial weights of linear layers; biases are 0."""
 
@@ -350,18 +357,26 @@ class PPOConfig:
     """How the learning rate falls to ppo.lr_final over max_steps."""
     lr_final: float = 0.0
     """Learning rate at the end of its schedule."""
+    schedules_count_batch: bool = False
+    """Whether schedules count the decisions of the batch that is learnt, so that the last one is learnt with
+    the final values (as ML-Agents), or only those before it."""
     critic_lr: Optional[float] = None
     """Learning rate of the critic at the start, with the schedule of ppo.lr; null: as ppo.lr."""
     separate_optimizers: bool = False
     """Clip the gradients of actor and critic apart, as two optimizers would; false: one norm over both."""
     optimizer: Optimizer = Optimizer.adam
     """Optimizer of the networks."""
+    optimizer_eps: float = 1e-5
+    """Epsilon of the optimizer, which keeps steps small where gradients are tiny."""
     weight_decay: float = 0.0
     """Weight decay of the optimizer."""
     gamma: float = 0.99
     """Discount of a decision."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation."""
+    time_horizon: Optional[int] = None
+    """Decisions of an agent after which its advantages are cut, and a value stands for the rest (as in
+    ML-Agents); null: they are cut only where a batch ends."""
     clip_epsilon: float = 0.2
     """Half-width of the ratio's clipping interval at the start."""
     clip_schedule: Schedule = Schedule.constant
@@ -402,6 +417,9 @@ class PPOConfig:
     """Decay, for each batch, of the running statistics of returns."""
     value_norm_update: ValueNormUpdate = ValueNormUpdate.batch
     """When these statistics move: once for each batch, or with each minibatch (the MAPPO paper's code)."""
+    obs_norm_update: ObsNormUpdate = ObsNormUpdate.batch
+    """With model.normalize_obs: when its statistics move, once for each batch, after its update (batch), or
+    while it is collected, with each round (round: ML-Agents moves them with each trajectory)."""
     reward_weight: float = 1.0
     """Weight of an agent's individual reward."""
     group_reward_weight: float = 1.0
@@ -425,9 +443,11 @@ class PPOConfig:
         _above("ppo.critic_lr", self.critic_lr, 0)
         _at_least("ppo.sequence_length", self.sequence_length, 1)
         _at_least("ppo.lr_final", self.lr_final, 0)
+        _above("ppo.optimizer_eps", self.optimizer_eps, 0)
         _at_least("ppo.weight_decay", self.weight_decay, 0)
         _within("ppo.gamma", self.gamma, 0, 1)
         _within("ppo.gae_lambda", self.gae_lambda, 0, 1)
+        _at_least("ppo.time_horizon", self.time_horizon, 1)
         _between("ppo.clip_epsilon", self.clip_epsilon, 0, 1)
         _between("ppo.clip_epsilon_final", self.clip_epsilon_final, 0, 1)
 

@@ -53,6 +53,7 @@ def estimate(
     *,
     gamma: float,
     gae_lambda: float,
+    horizon: int | None = None,
 ) -> Advantage:
     """Estimate advantages of slots that do not act in every round, by the recursion above.
 
@@ -63,11 +64,14 @@ def estimate(
         end_value_T: float ``[T, ...]``, value of the terminal observation (read where truncated).
         final_value: ``[...]``, value of the row after the last.
         truncated_T: bool ``[T, ...]``, episodes cut off; other ends are real.
+        gamma: discount of a decision.
+        gae_lambda: lambda.
+        horizon: decisions of a slot after which A_next counts as 0; None: nowhere but where the batch ends.
     """
     value = _flat(value_T)
     following = view.next_values(value, _row(final_value), _flat(end_value_T), _flat(truncated_T))
     delta = view.rewards(_flat(reward_T)) + np.float32(gamma) * following - value
-    advantage = view.scan(delta, gamma * gae_lambda)
+    advantage = view.scan(delta, gamma * gae_lambda, horizon)
     target = np.where(view.known, advantage + value, np.float32(0))
 
     def back(values: np.ndarray) -> Tensor:
@@ -86,6 +90,7 @@ def estimate_streams(
     *,
     gammas: Sequence[float],
     gae_lambda: float,
+    horizon: int | None = None,
 ) -> Advantage:
     """Estimate advantages and targets ``[T, ..., V]`` of V reward streams, each as in `estimate`.
 
@@ -96,7 +101,9 @@ def estimate_streams(
     """
     columns = [x.split(1, -1) for x in (reward_T, value_T, end_value_T, final_value)]
     parts = [
-        estimate(view, reward, value, end, final, truncated_T, gamma=gamma, gae_lambda=gae_lambda)
+        estimate(
+            view, reward, value, end, final, truncated_T, gamma=gamma, gae_lambda=gae_lambda, horizon=horizon
+        )
         for gamma, reward, value, end, final in zip(gammas, *columns, strict=True)
     ]
     if len(parts) == 1:

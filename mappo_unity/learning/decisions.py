@@ -99,19 +99,23 @@ class DecisionView:
         at_end = np.take_along_axis(np.where(truncated, end_value, 0), self.last, 0)
         return np.where(self.known, np.where(self.ends, at_end, onward), 0)
 
-    def scan(self, delta: np.ndarray, decay: float) -> np.ndarray:
+    def scan(self, delta: np.ndarray, decay: float, horizon: int | None = None) -> np.ndarray:
         """Run ``A_k = delta_k + decay * A_next`` from each slot's last row to its first.
 
         An end, and the row after the batch, have A = 0.
 
         Args:
             delta: float32 ``[T, N]``.
+            horizon: what comes after so many rows with a value, counted from the episode's first row in the
+                batch, counts as A = 0, too; None: nothing does.
 
         Returns:
             float32 ``[T, N]``, 0 where the outcome is not known.
         """
         delta = np.where(self.known, delta, 0).astype(np.float32)
         factor = np.where(self.known & ~self.ends, np.float32(decay), np.float32(0))
+        if horizon is not None:
+            factor[self._place() % horizon == 0] = 0
         factor[~self.valued] = 1  # rounds without a value pass on what they got
 
         out = np.empty((len(delta) + 1, delta.shape[1]), np.float32)
@@ -121,3 +125,10 @@ class DecisionView:
             out[t] += delta[t]
 
         return np.where(self.valued, out[:-1], 0)
+
+    def _place(self) -> np.ndarray:
+        """int64 ``[T, N]``: 1 for an episode's first row with a value in the batch, 2 for its second ..."""
+        count = self.valued.cumsum(0)
+        at_end = np.maximum.accumulate(np.where(self.ends, count, 0))
+        count[1:] -= at_end[:-1]
+        return count

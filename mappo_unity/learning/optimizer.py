@@ -22,7 +22,7 @@ def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch
     """
     kind = torch.optim.AdamW if cfg.optimizer is Optimizer.adamw else torch.optim.Adam
     groups = [{"params": list(net.parameters())} for net in (actor, critic)]
-    return kind(groups, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=1e-5, fused=True)
+    return kind(groups, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=cfg.optimizer_eps, fused=True)
 
 
 def set_learning_rates(optimizer: torch.optim.Optimizer, cfg: PPOConfig, progress: float) -> float:

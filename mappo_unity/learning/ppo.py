@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from mappo_unity import keys
-from mappo_unity.config.schema import PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
+from mappo_unity.config.schema import ObsNormUpdate, PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
 from mappo_unity.learning.advantage import (
     Advantage,
     approximate_kl,
@@ -39,7 +39,7 @@ from mappo_unity.learning.loss import (
 )
 from mappo_unity.learning.minibatches import make_buffer
 from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
-from mappo_unity.learning.networks.encoders import RunningNorm
+from mappo_unity.learning.networks.encoders import running_norms, update_norms
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.optimizer import (
     CriticWarmup,
@@ -92,7 +92,8 @@ class PolicyLearner:
 
         self.value_layers = value_layers(critic)  # which PopArt rescales
         self.bounded = [m for m in actor.modules() if isinstance(m, Actor)]
-        self.norms = [m for net in (actor, critic) for m in net.modules() if isinstance(m, RunningNorm)]
+        self.norms = [*running_norms(actor), *running_norms(critic)]
+        actor.moving_norms = running_norms(actor) if cfg.obs_norm_update is ObsNormUpdate.round else []
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
 
     def learn(self, batch: TensorDictBase, following: TensorDictBase, progress: float) -> dict[str, float]:
@@ -104,6 +105,9 @@ class PolicyLearner:
             progress: share of the run that is over, 0 to 1, for the schedules.
         """
         settings = self._set_schedules(progress) | self.warmup.begin(batch)
+        for norm in self.norms if self.actor.moving_norms else ():
+            norm.load_state_dict(self.actor.moving_norms[0].state_dict())  # the critic's follow
+
         metrics: dict[str, float] = {}
         if self.cloning is None or not self.cloning.cfg.only:
             buffer, metrics = self.prepare(batch, following)
@@ -111,7 +115,8 @@ class PolicyLearner:
             metrics |= self.rewards.learn()
         if self.cloning is not None:
             metrics |= self.cloning.learn(int(batch.get(keys.ACTING).sum()), settings["lr"], progress)
-        self._update_norms(batch)
+        if not self.actor.moving_norms:
+            update_norms(self.warmup.moving(self.norms), batch)  # after the update, which must not see it
         return metrics | settings
 
     def _set_schedules(self, progress: float) -> dict[str, float]:
@@ -144,6 +149,7 @@ class PolicyLearner:
             rounds.get(keys.TRUNCATED),
             gammas=self.rewards.gammas,
             gae_lambda=self.cfg.gae_lambda,
+            horizon=self.cfg.time_horizon,
         )
         self.carried.keep(rounds, view)
         self.reader.keep(values, rounds.get(VALUED) & ~gae.known)
@@ -253,14 +259,6 @@ class PolicyLearner:
                 "grad_norm": grad_norm.detach(),
             }
 
-    @torch.no_grad()
-    def _update_norms(self, batch: TensorDictBase) -> None:
-        """Take the batch's observations into the normalisers, after the update that must not see it."""
-        if self.norms:
-            rows = batch.get(keys.OBS)[batch.get(keys.ACTING).squeeze(-1)]
-            for norm in self.warmup.moving(self.norms):
-                norm.update(rows)
-
     def _trainable_state(self) -> dict[str, Any]:
         return {
             "actor": self.actor.state_dict(),
@@ -275,7 +273,10 @@ class PolicyLearner:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that resuming needs."""
-        return self._trainable_state() | {
+        state = self._trainable_state()
+        if self.actor.moving_norms:  # on, while what is returned here has not been written yet
+            state["actor"] = {name: value.clone() for name, value in state["actor"].items()}
+        return state | {
             "value_norm": self.value_norm.state_dict(),
             "carried": self.carried.state_dict(),
             "critic_states": self.reader.state_dict(),

@@ -36,7 +36,7 @@ from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.scenes.contract.images import looks_unmarked
-from mappo_unity.training.batches import Batch, BatchCollector, count_present
+from mappo_unity.training.batches import Batch, BatchCollector, count_decisions, count_present
 from mappo_unity.training.lessons.curriculum import lessons_of
 from mappo_unity.training.memory import check_batch_memory, check_network_memory
 
@@ -64,7 +64,6 @@ class TrainingSetup:
 
         self.guesses_channels = False
         self._make_learners(self.notes.append)
-        self.frozen = {name for name in self.learners if is_frozen(cfg, name)}
         if len(self.frozen) == len(self.learners):
             raise ConfigError(
                 f"behaviors.{next(iter(self.frozen))}.{TRAIN}=false: nothing is learnt, since every behavior "
@@ -80,6 +79,10 @@ class TrainingSetup:
         rounds = batch_rounds(self.cfg.collect, self.env)
         self.learners = make_learners(self.cfg, self.env, rounds, note, self.guesses_channels)
         self.policy = JointPolicy({name: learner.actor for name, learner in self.learners.items()})
+
+        self.frozen = {name for name in self.learners if is_frozen(self.cfg, name)}
+        for name in self.frozen:
+            self.learners[name].actor.moving_norms = []
 
     @contextmanager
     def collecting(self) -> Iterator[BatchCollector]:
@@ -98,8 +101,9 @@ class TrainingSetup:
 
         Args:
             batch: as collected.
-            progress: share of the run that is over, 0 to 1, for the schedules.
+            progress: share of the run that was over when the batch began, 0 to 1, for the schedules.
         """
+        share = count_decisions(batch.rounds, self.learners) / self.cfg.max_steps
         # Large minibatches gain from threads; small networks, while collecting, do not.
         torch.set_num_threads(min(self.cfg.update_threads, os.cpu_count() or 1))
         metrics: dict[str, dict[str, float]] = {}
@@ -107,7 +111,8 @@ class TrainingSetup:
             if name in batch.void:
                 learner.carried.void(batch.void[name])
             if name not in self.frozen:
-                metrics[name] = learner.learn(*batch.of(name), progress)
+                ahead = share if learner.cfg.schedules_count_batch else 0.0
+                metrics[name] = learner.learn(*batch.of(name), progress + ahead)
             if self.frozen:
                 metrics.setdefault(name, {})["frozen"] = float(name in self.frozen)
         torch.set_num_threads(self.cfg.num_threads)

@@ -21,7 +21,7 @@ from mappo_unity import keys
 from mappo_unity.config.schema import LOG_STD_RANGE, CriticKind, DistributionKind, MemoryKind, ModelConfig
 from mappo_unity.learning.networks.critics import CentralCritic, LocalCritic, PooledCritic
 from mappo_unity.learning.networks.distributions import ActionDistribution, ActionLayout, state_log_std
-from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
+from mappo_unity.learning.networks.encoders import Encoder, ObsLayout, RunningNorm, update_norms
 from mappo_unity.learning.networks.goals import condition_on_goals
 from mappo_unity.learning.networks.mlp import apply_options, init_head, make_mlp
 from mappo_unity.learning.networks.poca import PocaCritic
@@ -122,7 +122,8 @@ class UnityActor(ProbabilisticActor):
         obs_keys: the entries that it reads, in its order.
         layout: the sizes of an action.
 
-    Attributes: `keeps_components`, whether draws hold the log-probabilities of an action's components, too.
+    Attributes: `keeps_components`, whether draws hold the log-probabilities of an action's components, too;
+    `moving_norms`, the normalisers whose statistics move while a batch is collected.
     """
 
     def __init__(self, net: nn.Module, obs_keys: Sequence[str], layout: ActionLayout) -> None:
@@ -142,6 +143,7 @@ class UnityActor(ProbabilisticActor):
         self.obs_keys, self.layout = list(obs_keys), layout
         self.memory_size: int = 0 if memory is None else memory.state_size
         self.keeps_components = False
+        self.moving_norms: list[RunningNorm] = []
 
     @property
     def has_memory(self) -> bool:
@@ -263,6 +265,8 @@ class JointPolicy(TensorDictModuleBase):
 
         for name, inputs, actor in zip(self.names, self.inputs, self.actors.values()):
             entries = tensordict.get(name)
+            if isinstance(actor, UnityActor) and draws:
+                update_norms(actor.moving_norms, entries)
             if isinstance(actor, UnityActor) and actor.has_memory:
                 entries.set(keys.MEMORY, self._memory(name, actor.memory_size, entries))
 

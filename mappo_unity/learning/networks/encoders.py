@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from mlagents_envs.base_env import ObservationSpec
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from mappo_unity import keys
@@ -118,8 +119,8 @@ class ObsLayout:
 class RunningNorm(nn.Module):
     """Normalise features by running mean and variance: ``clip((x - mean) / std, +-5)``.
 
-    Statistics move only in `update`, never in `forward`, so that they stand still during a batch
-    and its update: the first minibatch then has ratio 1.
+    Statistics move only in `update`, never in `forward`, so that they stand still during an update, and, with
+    `ppo.obs_norm_update=batch`, while a batch is collected: its first minibatch then has ratio 1.
     """
 
     mean: Tensor
@@ -162,6 +163,19 @@ class RunningNorm(nn.Module):
         self.mean.add_(delta * weight)
         self.count.copy_(count)
         self.inv_std.copy_(1.0 / torch.sqrt(self.var + self.epsilon))
+
+
+def running_norms(net: nn.Module) -> list[RunningNorm]:
+    """Return all normalisers of a network."""
+    return [part for part in net.modules() if isinstance(part, RunningNorm)]
+
+
+def update_norms(norms: Sequence[RunningNorm], entries: TensorDictBase) -> None:
+    """Take the observations of who acts, in entries ``[..., A]`` of one policy name, into the statistics."""
+    if norms:
+        rows = entries.get(keys.OBS)[entries.get(keys.ACTING).squeeze(-1)]
+        for norm in norms:
+            norm.update(rows)
 
 
 class Encoder(nn.Module):

@@ -18,7 +18,7 @@ from mappo_unity.config.schema import CuriosityConfig, GAILConfig, PPOConfig, Re
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.distributions import ActionLayout
-from mappo_unity.learning.networks.encoders import ObsLayout, RunningNorm
+from mappo_unity.learning.networks.encoders import ObsLayout, RunningNorm, running_norms
 from mappo_unity.learning.rewards.curiosity import Curiosity
 from mappo_unity.learning.rewards.gail import Discriminator
 from mappo_unity.learning.rewards.rnd import RandomNetwork
@@ -42,7 +42,7 @@ class IntrinsicStream:
         self.model: Any = model
         learns = [parameter for parameter in model.parameters() if parameter.requires_grad]
         self.optimizer = torch.optim.Adam(learns, lr=cfg.lr)
-        self.norms = [part for part in model.modules() if isinstance(part, RunningNorm)]
+        self.norms = running_norms(model)
         self.returns = RunningNorm(1)  # of discounted sums of the reward
         self.returns.epsilon = 1e-12  # a predictor's errors become small
 
