@@ -130,7 +130,10 @@ TOLD = [
         "env=unity needs options of an environment of your own, which mappo-eval does",
     ),
     ("eval run=ball env=Basic", "run=ball cannot play 'Basic?team=0': it holds the policy '3DBall'"),
-    ("eval run=ball opponent=random", "opponent=... plays matches, which need an environment with two sides"),
+    (
+        "eval run=ball opponent=random",
+        "matches need an environment with two sides (team ids), and this one has 1: 3D",
+    ),
     ("eval run=soccer opponent=ball", "opponent=ball cannot play 'SoccerTwos?team=1': it holds the policy"),
     ("eval run=ball opponent=text.txt", "opponent=text.txt is neither a checkpoint nor an ONNX file"),
     (
