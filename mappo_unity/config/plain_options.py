@@ -1,7 +1,7 @@
 """Mistakes in the form of option=value, for the commands without presets.
 
-Those are mappo-eval, mappo-play, mappo-export and mappo-league. Switches, words alone and options given twice are told with
-how they are written.
+Those are mappo-eval, mappo-play, mappo-export and mappo-league. Switches, words alone and options given
+twice are told with how they are written.
 """
 
 from __future__ import annotations
