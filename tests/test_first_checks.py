@@ -132,7 +132,7 @@ TOLD = [
     ("eval run=ball env=Basic", "run=ball cannot play 'Basic?team=0': it holds the policy '3DBall'"),
     (
         "eval run=ball opponent=random",
-        "matches need an environment with two sides (team ids), and this one has 1: 3D",
+        "matches need an environment with two sides (team ids), and this one has 1",
     ),
     ("eval run=soccer opponent=ball", "opponent=ball cannot play 'SoccerTwos?team=1': it holds the policy"),
     ("eval run=ball opponent=text.txt", "opponent=text.txt is neither a checkpoint nor an ONNX file"),

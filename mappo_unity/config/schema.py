@@ -722,9 +722,9 @@ class LeagueConfig:
     """Options of a league."""
 
     policies: list[str] = field(default_factory=list)
-    """Who plays: random, run folders (their best checkpoints), checkpoints, ONNX files; words before options."""
+    """Who plays: random, run folders (best checkpoints), checkpoints, ONNX files; words before the options."""
     env: Optional[str] = None
-    """Environment to play in, a preset in conf/env; null: that of the first run. env.NAME=... sets its options."""
+    """Environment, a preset in conf/env; null: that of the first run. env.NAME=... sets its options."""
     matches: int = 100
     """Matches of each pair, half of them with the sides swapped."""
     out: Optional[str] = None
@@ -734,18 +734,16 @@ class LeagueConfig:
     seed: int = 0
     """Seed of the environments and the sampling."""
     workers: Optional[int] = None
-    """Processes that play side by side, a pair each; null: one for each core. The results do not depend on it."""
+    """Processes that play side by side, a pair each; null: one for each core. Results do not depend on it."""
 
     def __post_init__(self) -> None:
         if len(self.policies) < 2:
             raise ConfigError(
-                f"a league needs two policies or more, and has {', '.join(self.policies) or 'none'}: name them "
-                "before the options, mappo-league RUN_A RUN_B random env=SoccerTwos"
+                f"a league needs two policies or more, and has {', '.join(self.policies) or 'none'}: name "
+                "them before the options, mappo-league RUN_A RUN_B random env=SoccerTwos"
             )
         if "" in self.policies:
-            raise ConfigError(
-                "the name of a policy is empty: give random, a run folder, a checkpoint, an ONNX file"
-            )
+            raise ConfigError("a policy is empty: give random, a run folder, a checkpoint or an ONNX file")
         _not_empty(env=self.env, out=self.out)
         _at_least("matches", self.matches, 2)
         _within("seed", self.seed, 0, 2**31 - 1)

@@ -149,8 +149,8 @@ def _environment(cfg: LeagueConfig, sources: Sequence[Source], lines: Sequence[s
     check_effect(list(lines), [config])
     if config.env.backend is Backend.editor:
         raise ConfigError(
-            "env.backend=editor: a league opens the environment anew for every pair, and the Editor would want "
-            "Play to be pressed each time; build a player, env.backend=player env.file_name=..."
+            "env.backend=editor: a league opens the environment anew for every pair, and the Editor would "
+            "want Play to be pressed each time; build a player, env.backend=player env.file_name=..."
         )
     return config
 

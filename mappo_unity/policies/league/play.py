@@ -156,7 +156,7 @@ _stopped = False  # whether this process has been told to end
 
 
 def _begin_process() -> None:
-    """Leave Ctrl-C to the process of the league, end a pair's match at SIGTERM, and do not outlive the league."""
+    """Leave Ctrl-C to the league's process, end the matches at SIGTERM, and do not outlive the league."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _stop)
     parent: Any = multiprocessing.parent_process()

@@ -4,9 +4,11 @@ The model (R. A. Bradley and M. E. Terry, Rank analysis of incomplete block desi
 p. 324-345): a player rated r beats one rated s with probability 1 / (1 + 10^((s - r) / 400)), which is the
 scale of A. E. Elo. A draw counts as half a win and half a loss.
 
-A weak prior keeps the ratings of those finite who won or lost everything: they are normal around the league's
-mean with a standard deviation of 1000 points. The intervals are those of the profile likelihood, which, unlike
-the estimate plus and minus its standard error, are long on the side of which such results say little.
+A weak prior keeps the ratings of those finite who won or lost everything: ratings are normal around the
+league's mean with a standard deviation of 1000 points. The intervals are those of the profile likelihood,
+which, unlike the estimate plus and minus its standard error, are long on the side of which such results say
+little. Draws vary less than wins and losses, so that with many of them the intervals are too wide, not too
+narrow.
 """
 
 from __future__ import annotations
@@ -40,10 +42,10 @@ def rate(points: np.ndarray, anchor: int | None = None, prior: float | None = PR
     """Return the players' ratings.
 
     Args:
-        points: ``[N, N]``; in row i and column j what i scored against j, a win 1 and a draw 1/2. The matches of
-            the two are ``points[i, j] + points[j, i]``.
+        points: ``[N, N]``; in row i and column j what i scored against j, a win 1 and a draw 1/2. The
+            matches of the two are ``points[i, j] + points[j, i]``.
         anchor: the player who is rated `ANCHOR` by definition; None: the mean of all is.
-        prior: standard deviation in points; None: no prior, for results in which nobody won or lost everything.
+        prior: standard deviation in points; None: no prior, where nobody won or lost everything.
     """
     count = len(points)
     league = _League(np.asarray(points, float), 0.0 if prior is None else (ELO / prior) ** 2)
@@ -67,7 +69,7 @@ def expected(rating: float, other: float) -> float:
 
 
 class _League:
-    """The log-likelihood of strengths (in log-odds) with the prior's part: ``-precision / 2`` times squares."""
+    """The log-likelihood of strengths (in log-odds), less ``precision / 2`` times their squares: the prior."""
 
     def __init__(self, points: np.ndarray, precision: float) -> None:
         self.points, self.matches, self.precision = points, points + points.T, precision
@@ -116,8 +118,8 @@ class _League:
 def _end(league: _League, contrast: np.ndarray, best: np.ndarray, sign: int) -> float:
     """Return where twice the loss of log-likelihood reaches 1.96 squared, on one side of the estimate.
 
-    What is searched is z = the root of twice the loss, which grows nearly in proportion: Newton's method with a
-    bracket, from the standard error of the observed information.
+    What is searched is z = the root of twice the loss, which grows nearly in proportion: Newton's method with
+    a bracket, from the standard error of the observed information.
     """
     top, middle = league.value(best), float(contrast @ best)
     direction = np.linalg.solve(league.slopes(best)[1], contrast)

@@ -27,7 +27,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Standings:
-    """The players, best first, and ``[N, N, 3]`` wins, draws and losses of each (row) against each (column)."""
+    """The players, best first; ``[N, N, 3]`` wins, draws and losses of each (row) against each (column)."""
 
     rows: list[Row]
     outcomes: np.ndarray
