@@ -722,7 +722,7 @@ class LeagueConfig:
     """Options of a league."""
 
     policies: list[str] = field(default_factory=list)
-    """Who plays: random, run folders (best checkpoints), checkpoints, ONNX files; words before the options."""
+    """Who plays: random, run folders (best checkpoints), checkpoints, ONNX files; words before options."""
     env: Optional[str] = None
     """Environment, a preset in conf/env; null: that of the first run. env.NAME=... sets its options."""
     matches: int = 100

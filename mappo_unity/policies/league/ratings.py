@@ -69,7 +69,7 @@ def expected(rating: float, other: float) -> float:
 
 
 class _League:
-    """The log-likelihood of strengths (in log-odds), less ``precision / 2`` times their squares: the prior."""
+    """The log-likelihood of strengths in log-odds, less ``precision / 2`` times their squares (the prior)."""
 
     def __init__(self, points: np.ndarray, precision: float) -> None:
         self.points, self.matches, self.precision = points, points + points.T, precision
