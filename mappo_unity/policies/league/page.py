@@ -49,9 +49,9 @@ def page(league: League, standings: Standings) -> str:
         f"<h1>{title}</h1><p>{facts}</p>",
         f"<h2>Ratings</h2>{svg(standings, *ladder(standings))}",
         _players(standings),
-        f"<p>Bradley-Terry ratings on the Elo scale with 95 % intervals; {anchor} is {ANCHOR:.0f}. 200 "
-        f"points more mean {100 * expected(200, 0):.0f} % of the points, 400 more {100 * expected(400, 0):.0f} %. "
-        "A draw is half a win.</p>",
+        f"<p>Bradley-Terry ratings on the Elo scale with 95 % intervals; {anchor} is {ANCHOR:.0f}. A lead of "
+        f"200 points means {100 * expected(200, 0):.0f} % of the points, one of 400 "
+        f"{100 * expected(400, 0):.0f} %. A draw is half a win.</p>",
         f"<h2>Who beat whom</h2><div class='wide'>{svg(standings, *matrix(standings))}</div>",
         f"<h2>Pairs</h2>{_pairs(standings)}",
         "<p>Expected: the share of the points that the ratings alone would give. Far from what was won, the "

@@ -17,6 +17,8 @@ def short_names(words: Sequence[str], files: Sequence[str]) -> list[str]:
     parts = {word: PurePath(os.path.normpath(word)).parts for word in files}
     # the last part stays in any case
     shared = os.path.commonprefix([path[:-1] for path in parts.values()])
+    if shared == ("/",):
+        return list(words)
     names = {word: "/".join(path[len(shared) :]) for word, path in parts.items()}
 
     short = [names.get(word, word) for word in words]
