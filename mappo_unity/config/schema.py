@@ -577,7 +577,7 @@ class RewardsConfig:
     @property
     def intrinsic(self) -> dict[str, Any]:
         """The streams beside the environment's that are on, by name."""
-        streams = {"curiosity": self.curiosity, "rnd": self.rnd, "gail": self.gail}
+        streams: dict[str, Any] = {"curiosity": self.curiosity, "rnd": self.rnd, "gail": self.gail}
         return {name: stream for name, stream in streams.items() if stream.strength > 0}
 
 

@@ -87,17 +87,17 @@ def estimate_streams(
     gammas: Sequence[float],
     gae_lambda: float,
 ) -> Advantage:
-    """Estimate advantages and targets ``[T, ..., S]`` of V reward streams, each as in `estimate`.
+    """Estimate advantages and targets ``[T, ..., V]`` of V reward streams, each as in `estimate`.
 
     Args:
         view: see `estimate`; so are the others, with a last dimension V.
         truncated_T: bool ``[T, ..., 1]``.
         gammas: the discount of each stream.
     """
-    columns = zip(*(x.split(1, -1) for x in (reward_T, value_T, end_value_T, final_value)))
+    columns = [x.split(1, -1) for x in (reward_T, value_T, end_value_T, final_value)]
     parts = [
-        estimate(view, *column, truncated_T, gamma=gamma, gae_lambda=gae_lambda)
-        for column, gamma in zip(columns, gammas, strict=True)
+        estimate(view, reward, value, end, final, truncated_T, gamma=gamma, gae_lambda=gae_lambda)
+        for gamma, reward, value, end, final in zip(gammas, *columns, strict=True)
     ]
     if len(parts) == 1:
         return parts[0]

@@ -141,8 +141,11 @@ class RunState:
     def score(self) -> float:
         """Return what the best checkpoint is chosen by: return_mean; where there are two sides, the matches.
 
-        There one side's gain is the other's loss, and the mean return says nothing.
+        There one side's gain is the other's loss, and the mean return says nothing. Nor does that of
+        demonstrations played back, of which the newest checkpoint has learnt most.
         """
+        if self.cfg.bc.only:
+            return float(self.agent_steps)
         if self.matches.two_sided:
             return self.matches.score(self.agent_steps)
         return self.recent_episodes.summary()["return_mean"]

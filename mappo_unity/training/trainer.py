@@ -112,6 +112,7 @@ def _iterate(
         row = state.count(batch, collect_s=collected_s - started_s, update_s=learned_s - collected_s)
         row |= crashed | by_policy(learned)
         new_lessons = state.advance_lessons(batch, batches)
+        statistics = batch.statistics
         del batch  # the next one is collected without it
         saver.complete()  # whatever happens from here on, this iteration is saved
         for name, metrics in learned.items():
@@ -124,7 +125,7 @@ def _iterate(
             series = state.play_matches()
             saver.complete_matches()
         finally:  # a series that fails costs no row
-            log.log(*with_statistics(row | series, batch.statistics))
+            log.log(*with_statistics(row | series, statistics))
         if series:
             log.message(state.matches.said)
 

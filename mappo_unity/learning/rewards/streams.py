@@ -146,7 +146,7 @@ class RewardStreams:
             return own + group, {}
 
         self._decisions = find_transitions(rounds, following, view, self._obs_keys)
-        columns, metrics = [own + group], {}
+        columns, metrics = [own + group], dict[str, float]()
         for stream in self.intrinsic:
             reward, told = stream.rewards(self._decisions, view)
             reward = reward.view_as(own)

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mappo_unity.config.schema import ModelConfig
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.warm_start.actions import Actions, read_actions
 from mappo_unity.policies.warm_start.graph import Linear, OnnxGraph
@@ -64,7 +63,7 @@ class OnnxNetwork:
         if self.actions.mean is not None:
             out["action_distribution"] = "tanh_normal" if self.actions.squashed else "gaussian"
         kinds = {part.image.kind for part in self.parts if part.image is not None}
-        if len(kinds) == 1 and "" not in kinds and hasattr(ModelConfig(), "image_encoder"):
+        if len(kinds) == 1 and "" not in kinds:
             out["image_encoder"] = kinds.pop()
         if self.actions.init_log_std is not None:
             out["init_log_std"] = self.actions.init_log_std
