@@ -121,10 +121,14 @@ def test_a_folder_belongs_to_one_league(tmp_path: Path) -> None:
 
 def test_names_are_short_and_tell_the_players_apart() -> None:
     words = ["out/s/a", "random", "out/s/b/checkpoints/step_1.pt"]
-    assert short_names(words, [words[0], words[2]]) == ["a", "random", "b/checkpoints/step_1.pt"]
-    assert short_names(["x/best.onnx", "random"], ["x/best.onnx"]) == ["best.onnx", "random"]
-    assert short_names(["x/random", "random"], ["x/random"]) == ["x/random", "random"]
-    assert short_names(["/a/run", "/b/run"], ["/a/run", "/b/run"]) == ["/a/run", "/b/run"]
+    assert short_names(words) == ["a", "random", "step_1.pt"]
+    assert short_names(["a/x/best.pt", "b/x/best.pt", "c/y/best.pt"]) == [
+        "a/x/best.pt",
+        "b/x/best.pt",
+        "y/best.pt",
+    ]
+    assert short_names(["x/random", "y"]) == ["x/random", "y"]  # only the real random is called random
+    assert short_names(["b", "a/b", "/run"]) == ["b", "a/b", "run"]
 
 
 def test_words_before_the_options_are_the_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

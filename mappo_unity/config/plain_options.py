@@ -91,7 +91,7 @@ def take_policies(lines: Sequence[str]) -> list[str]:
         words.append(rest.pop(0))
 
     for line in rest:
-        if "=" not in line and not line.startswith("-") and line not in table:
+        if "=" not in line and line not in table and not any(word.startswith("-") for word in rest):
             raise ConfigError(f"{line!r} stands behind {rest[0]}: the policies come first, then the options")
     return [f"policies=[{','.join(map(quoted_path, words))}]", *rest] if words else rest
 

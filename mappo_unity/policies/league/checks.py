@@ -91,7 +91,7 @@ def check_league(cfg: LeagueConfig, lines: Sequence[str] = ()) -> League:
         check_two_sides(behaviors)
     check_fit(sources, known, behaviors)
 
-    names = short_names(cfg.policies, [word for word in cfg.policies if word != RANDOM])
+    names = short_names(cfg.policies)
     players = tuple(Player(*values) for values in zip(names, files, map(_digest, files)))
     league = League(
         players,

@@ -28,8 +28,8 @@ STYLE = """
   .lg-lost { fill: #e79a58; }
 }
 """
-_NAMES, _ROW, _EDGE = 170, 26, 12  # pixels: the names' column, a row, the edge of the picture
-_LETTERS = 24  # of a name; of a longer one the end is shown, where files of a run differ
+_NAMES, _ROW, _EDGE = 186, 26, 12  # pixels: the names' column, a row, the edge of the picture
+_LETTERS = 20  # of a name; of a longer one the end is shown, where files of a run differ
 _CELL = 34  # the least width of a cell of the matrix, pixels
 _VALUES = 66  # pixels right of the ladder for the ratings as numbers
 

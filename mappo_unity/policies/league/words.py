@@ -6,20 +6,20 @@ import os
 from collections.abc import Sequence
 from pathlib import PurePath
 
+from mappo_unity.policies.policy_files import RANDOM
 
-def short_names(words: Sequence[str], files: Sequence[str]) -> list[str]:
-    """Return the words as they were given, without the folders that all the files among them lie in.
+
+def short_names(words: Sequence[str]) -> list[str]:
+    """Return of each player's path the last parts, as many as tell it from the others, and from random.
 
     Args:
         words: the players as the user named them, no two the same.
-        files: those of them that are paths.
     """
-    parts = {word: PurePath(os.path.normpath(word)).parts for word in files}
-    # the last part stays in any case
-    shared = os.path.commonprefix([path[:-1] for path in parts.values()])
-    if shared == ("/",):
-        return list(words)
-    names = {word: "/".join(path[len(shared) :]) for word, path in parts.items()}
+    paths = {word: PurePath(os.path.normpath(word)).parts for word in [*words, RANDOM]}
+    return [_tail(paths[word], [path for other, path in paths.items() if other != word]) for word in words]
 
-    short = [names.get(word, word) for word in words]
-    return short if len(set(short)) == len(short) else list(words)
+
+def _tail(path: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> str:
+    lengths = range(1, len(path) + 1)
+    alone = (length for length in lengths if all(path[-length:] != other[-length:] for other in others))
+    return PurePath(*path[-next(alone, len(path)) :]).as_posix()
