@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 
 from mappo_unity.policies.league.checks import League
-from mappo_unity.policies.league.picture import STYLE, ladder, matrix, svg
+from mappo_unity.policies.league.picture import ladder, matrix, svg
 from mappo_unity.policies.league.ratings import ANCHOR, expected
 from mappo_unity.policies.league.standings import Standings
 from mappo_unity.policies.league.table import Result
@@ -18,10 +18,11 @@ body { margin: 0 auto; max-width: 46rem; padding: 1rem; background: #ffffff; col
   font: 16px/1.5 system-ui, sans-serif; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
 p { color: #5a646e; }
-svg { width: 100%; height: auto; }
+svg { width: 100%; min-width: 26rem; height: auto; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 th, td { padding: 0.3rem 0.5rem; text-align: right; border-bottom: 1px solid #d5dae0; }
+td.number { white-space: nowrap; }
 th.name, td.name { text-align: left; overflow-wrap: anywhere; min-width: 7rem; }
 @media (prefers-color-scheme: dark) {
   body { background: #14181c; color: #e6eaee; }
@@ -45,9 +46,9 @@ def page(league: League, standings: Standings) -> str:
         "<!DOCTYPE html>",
         f"<html lang='en'><head><meta charset='utf-8'><title>{title}</title>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<style>{_STYLE}{STYLE}</style></head><body>",
+        f"<style>{_STYLE}</style></head><body>",
         f"<h1>{title}</h1><p>{facts}</p>",
-        f"<h2>Ratings</h2>{svg(standings, *ladder(standings))}",
+        f"<h2>Ratings</h2><div class='wide'>{svg(standings, *ladder(standings))}</div>",
         _players(standings),
         f"<p>Bradley-Terry ratings on the Elo scale with 95 % intervals; {anchor} is {ANCHOR:.0f}. A lead of "
         f"200 points means {100 * expected(200, 0):.0f} % of the points, one of 400 "

@@ -9,7 +9,7 @@ from html import escape
 
 from mappo_unity.policies.league.standings import Standings
 
-STYLE = """
+_STYLE = """
 .lg-text { font: 12px system-ui, sans-serif; fill: #1d2329; }
 .lg-dim { font: 11px system-ui, sans-serif; fill: #5a646e; }
 .lg-ground { fill: #ffffff; }
@@ -39,17 +39,16 @@ def picture(standings: Standings) -> str:
     top, upper = ladder(standings)
     bottom, lower = matrix(standings)
     body = f"{top}<g transform='translate(0 {upper})'>{bottom}</g>"
-    return f"<?xml version='1.0' encoding='UTF-8'?>\n{svg(standings, body, upper + lower, STYLE)}\n"
+    return f"<?xml version='1.0' encoding='UTF-8'?>\n{svg(standings, body, upper + lower)}\n"
 
 
-def svg(standings: Standings, body: str, height: int, style: str = "") -> str:
+def svg(standings: Standings, body: str, height: int) -> str:
     """Return an SVG element around what was drawn."""
     width = _width(standings)
-    rules = f"<style>{style}</style>" if style else ""
+    size = f"width='{width}' height='{height}'"
     return (
-        f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width} {height}' width='{width}' "
-        f"height='{height}' role='img'>{rules}<rect class='lg-ground' width='{width}' height='{height}'/>"
-        f"{body}</svg>"
+        f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width} {height}' {size} role='img'>"
+        f"<style>{_STYLE}</style><rect class='lg-ground' {size}/>{body}</svg>"
     )
 
 

@@ -58,6 +58,6 @@ def standings_of(names: list[str], results: dict[Pair, list[Result]]) -> Standin
     rows = []
     for index in order:
         rating, totals = ratings[index], table[index].sum(0).tolist()
-        points = (round(value, 2) for value in (rating.rating, rating.low, rating.high))
-        rows.append(Row(names[index], *points, *totals))
+        middle, low, high = (round(value, 2) for value in (rating.rating, rating.low, rating.high))
+        rows.append(Row(names[index], middle, low, high, *totals))
     return Standings(rows, table[np.ix_(order, order)], [row for rows in results.values() for row in rows])
