@@ -59,7 +59,7 @@ def make_expert(demo: Demonstration, obs_keys: Sequence[str], device: str) -> Ex
         [tensor(entry) for entry in table],
         tensor(rows),
         tensor(rows + 1),
-        tensor(np.concatenate(parts, -1).astype(parts[0].dtype)),
+        tensor(np.concatenate(parts, -1).astype(np.float32 if demo.continuous.shape[1] else np.int64)),
         tensor(demo.done[known]),
     )
     # an episode whose first decision was left out begins with the next one

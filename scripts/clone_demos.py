@@ -1,0 +1,75 @@
+#!/usr/bin/env python3
+"""Clone recordings and play the clones in the embedded scenes.
+
+Unity's recordings of the real scenes (FOLDER holds Expert3DBall.demo, ExpertBasic.demo ...) are learnt from
+alone (`bc.only=true`), and the clones are evaluated here: a good one is a proof of the scene, too. Printed is
+a line a scene: the recording's decisions, its mean return (of episodes that ended; for one that did not,
+what was earned until then) and the clone's, sampled, with its standard error.
+
+    python scripts/clone_demos.py FOLDER [--scenes 3DBall Basic Hallway Pyramids] [--episodes 100]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from mappo_unity.protocol.demos.reader import read_demo
+
+HERE = Path(sys.executable).parent
+DEMOS = {
+    "3DBall": ("Expert3DBall", ["max_steps=60000", "ppo.lr=1e-3"]),
+    "Basic": ("ExpertBasic", ["max_steps=20000", "ppo.lr=1e-3"]),
+    "Hallway": ("ExpertHallway", ["max_steps=300000", "ppo.lr=2e-3"]),
+    "Pyramids": ("ExpertPyramid", ["max_steps=100000", "ppo.lr=1e-3", "model.hidden=[128,128]"]),
+}
+
+
+def main() -> None:
+    """Clone and evaluate every recording."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--scenes", nargs="+", choices=DEMOS, default=list(DEMOS))
+    parser.add_argument("--episodes", type=int, default=100)
+    arguments = parser.parse_args()
+
+    print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores", flush=True)
+    for scene in arguments.scenes:
+        name, options = DEMOS[scene]
+        demo = read_demo(arguments.folder / f"{name}.demo")
+        with tempfile.TemporaryDirectory() as out:
+            clone(scene, Path(demo.source), Path(out, "run"), options)
+            earned, error = evaluate(Path(out, "run"), arguments.episodes)
+        whole = demo.returns[: int(demo.done.sum())]
+        recorded = (whole if len(whole) else demo.returns).mean()
+        print(
+            f"{scene}: {len(demo)} decisions recorded, mean return {recorded:.2f}; "
+            f"clone {earned:.2f} +- {error:.2f} ({arguments.episodes} episodes)",
+            flush=True,
+        )
+
+
+def clone(scene: str, demo: Path, folder: Path, options: list[str]) -> None:
+    """Learn from a recording alone."""
+    lines = [f"env={scene}", "bc.only=true", f"bc.demos=['{demo.absolute()}']", f"hydra.run.dir={folder}"]
+    lines += ["collect.batch_size=2000", "ppo.minibatch_size=256", "log.progress=false", *options]
+    subprocess.run([HERE / "mappo-train", *lines], check=True, stdout=subprocess.DEVNULL)
+
+
+def evaluate(folder: Path, episodes: int) -> tuple[float, float]:
+    """Return the mean return of a run's best checkpoint, and its standard error."""
+    command = [HERE / "mappo-eval", f"run={folder}", f"episodes={episodes}"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    result = json.loads(done.stdout.splitlines()[-1])
+    return result["mean_return"], result["stderr"]
+
+
+if __name__ == "__main__":
+    main()
