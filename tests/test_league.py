@@ -165,3 +165,15 @@ def test_a_small_real_league(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def run_folder(path: Path) -> Path:
     path.mkdir()
     return path
+
+
+def test_sides_with_policies_of_their_own(tmp_path: Path) -> None:
+    league = replace(
+        league_in(tmp_path / "league", matches=2),
+        players=(Player("one", "random", ""), Player("random", "random", "")),
+        env=EnvConfig(name="StrikersVsGoalie", num_areas=1),
+    )
+    (rows,) = play_league(league, 1, lambda *args: None).values()
+    assert [row.side for row in rows] == ["Striker?team=0", "Goalie?team=1"]
+    assert rows[0].lost == 0 and rows[1].won == 0  # the goalie's side cannot score
+    assert all(row.won + row.drawn + row.lost == 1 for row in rows)
