@@ -45,6 +45,11 @@ def export_main(arguments: list[str] | None = None) -> int:
     return _run("export", arguments)
 
 
+def league_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-league: let policies play one another and rate them; return the exit code."""
+    return _run("league", arguments)
+
+
 def player_main(arguments: list[str] | None = None) -> int:
     """Run mappo-player: serve a scene as a Unity player; return the exit code."""
     return _run("player", arguments)

@@ -70,6 +70,20 @@ Example:
   mappo-export run=outputs/3DBall/2026-11-20_12-00-00 out=3DBall.onnx
 """
 
+LEAGUE_USAGE = """\
+Let policies play one another, each pair on both sides, and rate them: Bradley-Terry ratings on the Elo scale
+with 95 % intervals. The folder gets matches.csv, league.csv, league.svg and league.html.
+
+Usage:
+  mappo-league POLICY POLICY ... [option=value ...]   random, run folders, checkpoints and ONNX files
+  mappo-league --help | --version
+
+Examples:
+  mappo-league outputs/SoccerTwos/2026-11-20_12-00-00 SoccerTwos.onnx random matches=200 out=leagues/soccer
+  mappo-league A.onnx B.onnx random env=SoccerTwos env.num_areas=8 seed=1
+  mappo-league A.onnx B.onnx env=unity env.file_name=builds/Game      in a player, started for each pair
+"""
+
 
 def train_help(schema: type) -> str:
     """Return the help of mappo-train: usage, choices, options."""
@@ -90,6 +104,11 @@ def play_help(schema: type) -> str:
 def export_help(schema: type) -> str:
     """Return the help of mappo-export: usage, options."""
     return f"{EXPORT_USAGE}\n{option_text(schema)}"
+
+
+def league_help(schema: type) -> str:
+    """Return the help of mappo-league: usage, options."""
+    return f"{LEAGUE_USAGE}\n{option_text(schema)}"
 
 
 def option_text(schema: type) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from mappo_unity.config.overrides import shell_argument, shell_word
 from mappo_unity.training.sweep import JobResult, SweepResult, job_options, varied_options
 
 if TYPE_CHECKING:
+    from mappo_unity.policies.league.standings import Standings
+    from mappo_unity.policies.league.table import Result
     from mappo_unity.training.trainer import Outcome
 
 RESULTS = "results.csv"
@@ -124,6 +127,24 @@ def eval_table(result: dict[str, Any]) -> Table:
         label = _LABELS.get(last, last.replace("_", " "))
         table.add_row(above + dot + label, _percent(value) if last in _SHARES else show_number(value))
 
+    return table
+
+
+def pair_line(pair: tuple[str, str], results: Sequence[Result], done: int, total: int) -> str:
+    """Return what mappo-league says after each pair."""
+    won, drawn, lost = (sum(getattr(row, name) for row in results) for name in ("won", "drawn", "lost"))
+    return f"{done}/{total} pairs: {pair[0]} against {pair[1]}: {won} won, {drawn} drawn, {lost} lost"
+
+
+def league_table(standings: Standings) -> Table:
+    """Return a league's players as a table, best first."""
+    table = Table(title="League")
+    table.add_column("name", overflow="fold")
+    for name in ("rating", "95 % from", "to", "won", "drawn", "lost"):
+        table.add_column(name, justify="right")
+    for row in standings.rows:
+        points = (f"{value:.0f}" for value in (row.rating, row.low, row.high))
+        table.add_row(row.name, *points, str(row.won), str(row.drawn), str(row.lost))
     return table
 
 

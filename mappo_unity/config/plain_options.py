@@ -1,7 +1,7 @@
 """Mistakes in the form of option=value, for the commands without presets.
 
-Those are mappo-eval, mappo-play and mappo-export. Switches, words alone and options given twice are told with
-how they are written.
+Those are mappo-eval, mappo-play, mappo-export and mappo-league. Switches, words alone and options given
+twice are told with how they are written.
 """
 
 from __future__ import annotations
@@ -9,11 +9,13 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table
 from mappo_unity.config.overrides import parse, shell_word
 from mappo_unity.config.presets import group_choices
-from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, PlayConfig
+from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, LeagueConfig, PlayConfig
+from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
 
 _COMMANDS = {
@@ -21,6 +23,7 @@ _COMMANDS = {
     "mappo-eval": EvalConfig,
     "mappo-play": PlayConfig,
     "mappo-export": ExportConfig,
+    "mappo-league": LeagueConfig,
 }
 """The commands that take option=value, and their options."""
 
@@ -58,17 +61,43 @@ def check_form(lines: Sequence[str], schema: type) -> None:
             )
 
 
-def take_parameters(lines: Sequence[str]) -> tuple[list[str], list[str]]:
+def take_parameters(lines: Sequence[str], below: str = "env.params") -> tuple[list[str], list[str]]:
     """Return the lines that set environment parameters, in mappo-train's grammar, and all others.
+
+    `below`: the section whose options are taken; "env" takes all options of the environment.
 
     Raises:
         ConfigError: one has several values.
     """
-    own = [line for line in lines if re.match(r"env\.params[.=]", line)]
+    pattern = r"env\." if below == "env" else rf"{re.escape(below)}[.=]"
+    own = [line for line in lines if re.match(pattern, line)]
     for override, line in zip(parse(own), own):
         if override.is_sweep_override():
             raise ConfigError(f"{line}: {override.key_or_group} takes one value here")
     return own, [line for line in lines if line not in own]
+
+
+def take_policies(lines: Sequence[str]) -> list[str]:
+    """Return the lines of mappo-league with the words before the options as the option `policies`.
+
+    Raises:
+        ConfigError: a word stands behind an option.
+    """
+    table = option_table(LeagueConfig)
+    words: list[str] = []
+    rest = list(lines)
+    # the name of a folder may have = in it: ppo.lr=1e-4 is what a sweep calls one
+    while rest and not rest[0].startswith("-") and ("=" not in rest[0] or _is_folder(rest[0], table)):
+        words.append(rest.pop(0))
+
+    for line in rest:
+        if "=" not in line and line not in table and not any(word.startswith("-") for word in rest):
+            raise ConfigError(f"{line!r} stands behind {rest[0]}: the policies come first, then the options")
+    return [f"policies=[{','.join(map(quoted_path, words))}]", *rest] if words else rest
+
+
+def _is_folder(word: str, table: dict[str, Option]) -> bool:
+    return word.partition("=")[0] not in table and Path(word).exists()
 
 
 def _check_other_command(key: str, schema: type, table: dict[str, Option]) -> None:

@@ -738,6 +738,39 @@ class EvalConfig:
 
 
 @dataclass
+class LeagueConfig:
+    """Options of a league."""
+
+    policies: list[str] = field(default_factory=list)
+    """Who plays: random, run folders (best checkpoints), checkpoints, ONNX files; words before options."""
+    env: Optional[str] = None
+    """Environment, a preset in conf/env; null: that of the first run. env.NAME=... sets its options."""
+    matches: int = 100
+    """Matches of each pair, half of them with the sides swapped."""
+    out: Optional[str] = None
+    """Folder for the results, new or that of the same league, which goes on; null: outputs/league."""
+    deterministic: bool = False
+    """Take the most likely action instead of a sampled one."""
+    seed: int = 0
+    """Seed of the environments and the sampling."""
+    workers: Optional[int] = None
+    """Processes that play side by side, a pair each; null: one for each core. Results do not depend on it."""
+
+    def __post_init__(self) -> None:
+        if len(self.policies) < 2:
+            raise ConfigError(
+                f"a league needs two policies or more, and has {', '.join(self.policies) or 'none'}: name "
+                "them before the options, mappo-league RUN_A RUN_B random env=SoccerTwos"
+            )
+        if "" in self.policies:
+            raise ConfigError("a policy is empty: give random, a run folder, a checkpoint or an ONNX file")
+        _not_empty(env=self.env, out=self.out)
+        _at_least("matches", self.matches, 2)
+        _within("seed", self.seed, 0, 2**31 - 1)
+        _at_least("workers", self.workers, 1)
+
+
+@dataclass
 class ExportConfig:
     """Options of an export."""
 

@@ -40,7 +40,7 @@ def check_evaluation(cfg: EvalConfig, params: Sequence[str] = ()) -> None:
     sources = [locate(cfg.run, "run")]
     if cfg.opponent is not None:
         sources.append(locate(cfg.opponent, "opponent"))
-    known = [_open(source, cfg.deterministic) for source in sources]
+    known = [open_known(source, cfg.deterministic) for source in sources]
 
     config = _environment(sources[0], known[0], cfg.env, "mappo-eval", params)
     try:
@@ -53,23 +53,23 @@ def check_evaluation(cfg: EvalConfig, params: Sequence[str] = ()) -> None:
         told.details = error.details
         raise told from error
 
-    behaviors = _behaviors(config.env)
+    behaviors = behaviors_seen(config.env)
     if behaviors and cfg.opponent is not None:
         check_two_sides(behaviors)
-    _check_fit(sources, known, behaviors)
+    check_fit(sources, known, behaviors)
 
 
 def check_film(cfg: PlayConfig) -> None:
     """Raise ConfigError if nothing can be shown with these options; what shows it is looked at elsewhere."""
     option = "run" if cfg.run is not None else "policy"
     source = locate(cfg.run or cfg.policy or "random", option)
-    known = _open(source, cfg.deterministic)
+    known = open_known(source, cfg.deterministic)
 
     config = _environment(source, known, cfg.env, "mappo-play")
     check_embedded(config.env)
     check_environment(config)
-    behaviors = _behaviors(config.env)
-    _check_fit([source], [known], behaviors)
+    behaviors = behaviors_seen(config.env)
+    check_fit([source], [known], behaviors)
     if cfg.record is not None:
         recording_files(Path(cfg.record), behaviors)
 
@@ -143,7 +143,7 @@ def check_embedded(env: EnvConfig) -> None:
         )
 
 
-def _open(source: Source, deterministic: bool) -> Any:
+def open_known(source: Source, deterministic: bool) -> Any:
     """Return what can be known of a policy: a checkpoint's plain values, an ONNX policy, None for chance."""
     if source.kind is Kind.random:
         return None
@@ -194,7 +194,7 @@ def _trained_in(known: Any) -> str | None:
     return name if isinstance(name, str) else None
 
 
-def _behaviors(env: EnvConfig) -> Mapping[str, Any]:
+def behaviors_seen(env: EnvConfig) -> Mapping[str, Any]:
     """Return the specs of an embedded scene's behaviors; nothing of others, which are not started here."""
     if env.backend is not Backend.embedded:
         return {}
@@ -208,7 +208,7 @@ def _behaviors(env: EnvConfig) -> Mapping[str, Any]:
         scene.close()
 
 
-def _check_fit(sources: Iterable[Source], known: Iterable[Any], behaviors: Mapping[str, Any]) -> None:
+def check_fit(sources: Iterable[Source], known: Iterable[Any], behaviors: Mapping[str, Any]) -> None:
     for source, policy in zip(sources, known):
         for name, spec in behaviors.items():
             if isinstance(policy, Mapping):

@@ -97,8 +97,8 @@ def check_two_sides(behaviors: Iterable[str]) -> dict[int, list[str]]:
     sides = sides_of(names)
     if len(sides) != 2:
         raise ConfigError(
-            "opponent=... plays matches, which need an environment with two sides (team ids); this one has "
-            f"{len(sides)}: {', '.join(names)}. Leave opponent out to play episodes"
+            f"matches need an environment with two sides (team ids), and this one has {len(sides)}: "
+            f"{', '.join(names)}; mappo-eval without opponent=... plays episodes there"
         )
     return dict(sorted(sides.items()))
 

@@ -1,4 +1,4 @@
-"""One training run at a time in a run folder, by a lock.
+"""One training run at a time in a run folder, or one league in its folder, by a lock.
 
 The operating system holds the lock for this process, and takes it back however the process ends: none is ever
 left over. Those who only read a run (evaluation, export, videos) take none.
@@ -20,10 +20,10 @@ _FAR = 1 << 30  # Windows locks bytes, which nobody may read meanwhile: one far 
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[str | None]:
+def locked(folder: Path, busy: str | None = None) -> Iterator[str | None]:
     """Hold the folder's lock; yield a warning where the place has no locks, else None.
 
-    Raises ConfigError where another process trains in the folder.
+    Raises ConfigError where another process trains in the folder; `busy` says what it does instead.
     """
     try:
         file = (folder / LOCK).open("a+b")
@@ -32,13 +32,17 @@ def locked(folder: Path) -> Iterator[str | None]:
         return
 
     with file:  # closing it gives the lock back
-        yield _take(folder, file)
+        yield _take(folder, file, busy)
 
 
-def _take(folder: Path, file: BinaryIO) -> str | None:
+def _take(folder: Path, file: BinaryIO, busy: str | None) -> str | None:
     try:
         _lock(file)
     except BlockingIOError as error:
+        if busy is not None:
+            raise ConfigError(
+                f"{busy} by another process{_holder(file)}: wait for its end or end it"
+            ) from error
         raise ConfigError(
             f"the run in {folder} is being trained by another process{_holder(file)}: wait for its end or "
             "end it, then resume the run; mappo-eval, mappo-export and mappo-play can read it meanwhile"
