@@ -25,6 +25,8 @@ class EvenSampler(Sampler):
 
     def __init__(self, decisions: Tensor, count: int) -> None:
         self.decisions, self.count = decisions, count
+        # where all rows hold the same number, every order is cut at the same places
+        self._is_even, self._sizes = bool((decisions == decisions[0]).all()), list[int]()
         self._parts: list[Tensor] = []
         self._ran_out = False
 
@@ -38,13 +40,18 @@ class EvenSampler(Sampler):
 
     def _shuffle(self) -> list[Tensor]:
         order = torch.randperm(len(self.decisions)).to(self.decisions.device)
+        if not (self._is_even and self._sizes):
+            self._sizes = self._cut(order)
+        return [part for part in order.split(self._sizes) if len(part)]
+
+    def _cut(self, order: Tensor) -> list[int]:
+        """Return how many rows in this order each minibatch takes."""
         total = self.decisions[order].cumsum(0)
 
         # the middle of a row's decisions says which share it belongs to
         middle = total.double() - self.decisions[order].double() / 2
         share = (middle * self.count / total[-1]).long().clamp_(0, self.count - 1)
-        sizes = torch.bincount(share, minlength=self.count).tolist()
-        return [part for part in order.split(sizes) if len(part)]
+        return torch.bincount(share, minlength=self.count).tolist()
 
     @property
     def ran_out(self) -> bool:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import Any
 
@@ -44,6 +43,7 @@ from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.optimizer import (
     CriticWarmup,
     clip_gradients,
+    cloned,
     in_two_groups,
     make_optimizer,
     set_learning_rates,
@@ -193,7 +193,7 @@ class PolicyLearner:
 
     def update(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Run the epochs; take everything back if a number is not finite or the KL explodes."""
-        before = copy.deepcopy(self._trainable_state())
+        before = cloned(self._trainable_state())
 
         sums: dict[str, Tensor] = {}
         steps, kl_epoch, stopped = 0, 0.0, False

@@ -16,7 +16,6 @@ from mappo_unity.config.overrides import given_options
 from mappo_unity.config.schema import Config, ModelConfig
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.policy_files import Kind, Source, check_checkpoint, locate
-from mappo_unity.policies.warm_start.onnx_network import read_network
 
 STARTS = "a run folder, a checkpoint (.pt) or an ONNX file"
 
@@ -85,6 +84,9 @@ def _shape_of(where: Any, option: str) -> dict[str, Any]:
 
     source = find_source(where, option)
     if source.kind is Kind.onnx:
+        # it loads torch, which mistakes told before need not wait for
+        from mappo_unity.policies.warm_start.onnx_network import read_network
+
         return read_network(source.path).options
     check_checkpoint(source)
     return {}
