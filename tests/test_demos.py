@@ -18,7 +18,6 @@ from mlagents_envs.base_env import (
     BehaviorSpec,
     DecisionSteps,
     DimensionProperty,
-    ObservationSpec,
     ObservationType,
     TerminalSteps,
 )
@@ -31,6 +30,7 @@ from mappo_unity.protocol.demos.recording_env import RecordingEnv, recording_fil
 from mappo_unity.protocol.demos.writer import DemoWriter
 from mappo_unity.protocol.encode import BehaviorEncoder
 from mappo_unity.protocol.protobuf import install
+from mappo_unity.scenes.contract.images import ByteImage
 from mappo_unity.scenes.registry import make_scene
 
 install()
@@ -109,7 +109,7 @@ def test_files_and_folders_are_joined_in_order(tmp_path: Path) -> None:
 
 def test_pictures_and_numbers_of_one_sensor_come_back(tmp_path: Path) -> None:
     flat, none = DimensionProperty.TRANSLATIONAL_EQUIVARIANCE, DimensionProperty.NONE
-    camera = ObservationSpec((4, 4, 3), (flat, flat, none), ObservationType.DEFAULT, "camera")
+    camera = ByteImage((4, 4, 3), (flat, flat, none), ObservationType.DEFAULT, "camera")
     spec = BehaviorSpec([camera, vector_spec(1)], ActionSpec(0, (2,)))
     levels = np.arange(48, dtype=np.float32).reshape(1, 4, 4, 3) / np.float32(255)
     writer = DemoWriter(tmp_path / "run.demo", "Camera", spec)

@@ -187,6 +187,8 @@ def test_time_limits_bootstrap_and_real_ends_do_not(tmp_path, probe, expected):
 
 
 def test_every_probe_is_tested():
-    files = (Path(__file__).with_name(name) for name in ("test_probes.py", "test_memory.py"))
+    files = (
+        Path(__file__).with_name(f"test_{name}.py") for name in ("probes", "memory", "rewards", "lessons")
+    )
     text = "".join(file.read_text() for file in files)
     assert all(f'"{name}"' in text for name in PROBES)

@@ -110,10 +110,10 @@ def test_what_a_rescue_saved_goes_on_as_if_nothing_had_been(monkeypatch):
 def test_a_full_disk_for_the_metrics_costs_no_iteration(monkeypatch, capfd):
     log = RunLog.log
 
-    def full(run_log, row):
+    def full(run_log, row, *more):
         if row["iteration"] == 3:
             raise ConfigError("the metrics cannot be written (No space left on device)")
-        log(run_log, row)
+        log(run_log, row, *more)
 
     monkeypatch.setattr(RunLog, "log", full)
     assert train_main([*BASIC, "max_steps=5000", "checkpoint_interval=1000000"]) == 2

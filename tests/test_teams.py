@@ -147,7 +147,7 @@ def test_options_of_one_behavior():
     ("behaviors", "message"),
     [
         ({"Golie": {}}, r"behaviors\.Golie: the environment has no behavior 'Golie'; it has Goalie, Striker"),
-        ({"Goalie": {"pp": {}}}, "only the sections model, ppo, rewards, init_from and train"),
+        ({"Goalie": {"pp": {}}}, "only the sections model, ppo, rewards, bc, init_from and train"),
         (
             {"Goalie": {"ppo": {"lrr": 1}}},
             r"behaviors\.Goalie\.ppo\.lrr: there is no such option; did you mean lr",
