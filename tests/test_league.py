@@ -66,6 +66,7 @@ def test_a_league_that_was_cut_off_goes_on_to_the_same_end(tmp_path: Path) -> No
     assert files_of(whole.folder) == files_of(cut.folder)
 
 
+@pytest.mark.slow
 def test_processes_change_nothing_and_seeds_do(tmp_path: Path) -> None:
     one, two, other = league_in(tmp_path / "1"), league_in(tmp_path / "2"), league_in(tmp_path / "3", seed=4)
     play_all(one)
