@@ -59,8 +59,10 @@ class IntrinsicStream:
             return reward, {}
 
         # vectors are known before they are judged: nothing here must stand still during an update
-        for norm in self.norms:
-            norm.update(decisions.obs[0])
+        if self.norms:
+            vectors = decisions.table[0][decisions.at]  # `obs` would gather images, too
+            for norm in self.norms:
+                norm.update(vectors)
 
         everything = torch.arange(len(decisions), device=decisions.at.device)
         parts = [self.model.rewards(decisions[index]) for index in everything.split(ROWS)]
