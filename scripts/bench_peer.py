@@ -29,6 +29,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from learn_scene import append
+
 ROOT = Path(__file__).resolve().parents[1]
 TRAINERS = "mlagents-learn", "mappo-unity"
 COLORS = "tab:orange", "tab:blue"
@@ -220,16 +222,6 @@ def results(out: Path) -> list[dict[str, str]]:
         return []
     with open(path) as file:
         return list(csv.DictReader(file))
-
-
-def append(path: Path, row: dict[str, object]) -> None:
-    """Append a row to a CSV file, which gets a head if it is new."""
-    is_new = not path.exists()
-    with open(path, "a", newline="") as file:
-        writer = csv.DictWriter(file, list(row))
-        if is_new:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 Curves = dict[tuple[str, str, int], list[tuple[int, float]]]
