@@ -24,6 +24,7 @@ MASK = "action_mask"  # bool [..., A, sum of branches]: True = allowed (Unity's 
 ACTING = "acting"  # bool [..., A, 1]: the agent requested a decision in this round
 MEMORY = "memory"  # float32 [..., A, M]: the actor's state under which the agent acts
 MEMORY_AFTER = "memory_after"  # float32 [..., A, M]: the actor's state after that decision
+PLAYER = "player"  # int64 [..., A, 1]: who plays the agent, `LEARNER` or the number of an opponent
 PRESENT = "present"  # bool [..., A, 1]: an agent holds the slot (or held it and departed)
 DEPARTED = "departed"  # bool [..., A, 1]: the agent ended for good while its team plays on
 FIRST = "is_init"  # bool [..., A, 1]: the decision requested is the first of its agent's episode
@@ -40,6 +41,9 @@ CUT_OFF_AT = "cut_off_at"  # int64 [n]: which team rows of the batch these are, 
 VALUE = "state_value"  # float32 [..., A, V]: in the critic's (normalised) space
 ADVANTAGE = "advantage"  # float32 [..., A, 1]
 VALUE_TARGET = "value_target"  # float32 [..., A, V]: in the critic's (normalised) space
+
+LEARNER = -1
+"""The `PLAYER` of agents that the policy which learns plays; others act, but not in the learner's sense."""
 
 
 def policy_name(behavior_name: str) -> str:

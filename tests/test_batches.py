@@ -26,8 +26,9 @@ from mappo_unity.config.schema import (
 from mappo_unity.envs.following import followed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.learning.minibatches import EvenSampler, minibatch_count
-from mappo_unity.training.batches import BatchCollector
-from mappo_unity.training.setup import make_collector, make_learners, set_up
+from mappo_unity.training.collection.batches import BatchCollector
+from mappo_unity.training.learners import make_learners
+from mappo_unity.training.setup import make_collector, set_up
 
 
 def slow_agents(seed: int, every: int = 5, agents: int = 10) -> Any:
@@ -118,7 +119,7 @@ def test_episodes_travel_in_the_batch(tmp_path: Path) -> None:
     env = UnityEnv(waiting_agent, 0)
     cfg = options(waiting_agent, rounds=8)
     (learner,) = make_learners(cfg, env, 8, print).values()
-    from mappo_unity.learning.networks.actor_critic import JointPolicy
+    from mappo_unity.learning.networks.joint_policy import JointPolicy
 
     policy = JointPolicy({"Fake": learner.actor})
     batches = BatchCollector(make_collector(followed(env), policy), env, cfg.collect)

@@ -28,7 +28,7 @@ from mappo_unity.config.schema import (
 from mappo_unity.envs.following import FollowedEnv
 from mappo_unity.envs.transforms import make_transforms
 from mappo_unity.learning.ppo import PolicyLearner
-from mappo_unity.training.batches import BatchCollector
+from mappo_unity.training.collection.batches import BatchCollector
 from mappo_unity.training.setup import make_collector, set_up
 
 NAMES = ("One?team=0", "Soccer?team=0", "Soccer?team=1")

@@ -43,7 +43,7 @@ from mappo_unity.scenes.contract.images import (
     sends_channels_last,
 )
 from mappo_unity.training import resume_check
-from mappo_unity.training.setup import note_unmarked
+from mappo_unity.training.learners import note_unmarked
 from mappo_unity.training.trainer import FINISHED, train
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

@@ -10,9 +10,10 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from mappo_unity.config.schema import ModelConfig
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.networks.actor_critic import Actor, JointPolicy, make_actor
+from mappo_unity.learning.networks.actor_critic import Actor, make_actor
 from mappo_unity.learning.networks.distributions import ActionDistribution, ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout, RunningNorm
+from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.learning.value_norm import ValueNorm
 
 

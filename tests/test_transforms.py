@@ -11,9 +11,10 @@ from torchrl.modules import ProbabilisticActor
 from mappo_unity.config.schema import ModelConfig
 from mappo_unity.envs.transforms import make_transforms, transformed
 from mappo_unity.envs.unity_env import UnityEnv
-from mappo_unity.learning.networks.actor_critic import JointPolicy, make_actor
+from mappo_unity.learning.networks.actor_critic import make_actor
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
+from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.scenes import make_scene
 from mappo_unity.training.setup import make_collector
 

@@ -615,6 +615,61 @@ class CollectConfig:
         _at_least("collect.rounds", self.rounds, 1)
 
 
+class OpponentDraw(Enum):
+    """How past opponents are drawn."""
+
+    uniform = "uniform"
+    hardest = "hardest"
+
+
+@dataclass
+class SelfPlayConfig:
+    """Self-play against past policies, in environments with two sides.
+
+    Names and defaults are ML-Agents'; decisions are those of the run.
+    """
+
+    save_steps: Optional[int] = None
+    """Agent decisions between two snapshots that join the pool; null: there is none, newest play newest."""
+    window: int = 10
+    """Newest snapshots that are opponents."""
+    play_against_latest_model_ratio: float = 0.5
+    """Share of the teams whose opponent plays the newest weights."""
+    swap_steps: int = 2000
+    """Agent decisions after which other opponents are drawn, which play from a team's next episode on."""
+    team_change: Optional[int] = None
+    """Agent decisions after which the other side learns and the environment is reset (ML-Agents: 5 times
+    save_steps); null: both learn, both at once where newest play newest, else one of them."""
+    initial_elo: float = 1200.0
+    """Elo rating at the start, and of fixed opponents."""
+    opponents: OpponentDraw = OpponentDraw.uniform
+    """How they are drawn: uniform, or hardest: by (1 - p)^2 for a share p won against each (as AlphaStar)."""
+    num_opponents: int = 4
+    """Past opponents that are met at the same time, at most; each costs a forward pass a round."""
+    fixed: list[str] = field(default_factory=list)
+    """Opponents that are always in the pool: random, run folders, checkpoints, ONNX files."""
+    skip_missing: bool = False
+    """With resume: go on without snapshots whose files are missing or damaged."""
+
+    def __post_init__(self) -> None:
+        _at_least("self_play.save_steps", self.save_steps, 1)
+        _at_least("self_play.window", self.window, 1)
+        _within("self_play.play_against_latest_model_ratio", self.play_against_latest_model_ratio, 0, 1)
+        _at_least("self_play.swap_steps", self.swap_steps, 0)
+        _at_least("self_play.team_change", self.team_change, 1)
+        _rule("self_play.initial_elo", self.initial_elo, True, "must be a finite number")
+        _at_least("self_play.num_opponents", self.num_opponents, 1)
+        if "" in self.fixed:
+            raise ConfigError(
+                "self_play.fixed has an empty entry: give random, a run folder, a checkpoint or an ONNX file"
+            )
+
+    @property
+    def is_on(self) -> bool:
+        """Whether there is a pool of opponents."""
+        return self.save_steps is not None or bool(self.fixed)
+
+
 @dataclass
 class MatchConfig:
     """Matches against a random side while training, for environments with two sides.
@@ -666,6 +721,8 @@ class Config:
     """Behavioral cloning from demonstrations."""
     collect: CollectConfig = field(default_factory=CollectConfig)
     """Collecting experience."""
+    self_play: SelfPlayConfig = field(default_factory=SelfPlayConfig)
+    """Self-play against past policies."""
     matches: MatchConfig = field(default_factory=MatchConfig)
     """Matches against a random side while training."""
     log: LogConfig = field(default_factory=LogConfig)

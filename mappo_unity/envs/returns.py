@@ -16,6 +16,8 @@ class Episode(NamedTuple):
     length: int  # decisions
     interrupted: bool
     group_id: int = 0  # 0 = alone
+    slot: int = -1  # of the behavior, in which it ended; -1: not told
+    round: int = -1  # in which it ended, see `UnityEnv.rounds`; -1: not told
 
 
 class Returns:
@@ -27,6 +29,7 @@ class Returns:
         self.individual_return = np.zeros(count)
         self.group_return = np.zeros(count)
         self.length = np.zeros(count, np.int64)
+        self.round = -1  # the one that is played, which the environment counts
         self._finished: list[Episode] = []
 
     def add(self, slots: np.ndarray, reward: np.ndarray, group_reward: np.ndarray) -> None:
@@ -48,7 +51,8 @@ class Returns:
             if drop[slot]:
                 continue
             returns = float(self.individual_return[slot]), float(self.group_return[slot])
-            self._finished.append(Episode(agent, *returns, int(self.length[slot]), bool(cut)))
+            length = int(self.length[slot])
+            self._finished.append(Episode(agent, *returns, length, bool(cut), slot=slot, round=self.round))
 
         self.individual_return[rows] = self.group_return[rows] = self.length[rows] = 0
 

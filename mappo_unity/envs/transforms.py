@@ -85,7 +85,7 @@ class TransformedUnityEnv(TransformedEnv):
         if not all(type(transform) in (Stack, CatTensors, ExcludeTransform) for transform in transforms):
             return {}
 
-        written = {keys.ACTION, keys.LOG_PROB, keys.LOG_PROBS, keys.MEMORY}
+        written = {keys.ACTION, keys.LOG_PROB, keys.LOG_PROBS, keys.MEMORY, keys.PLAYER}
         beside = written | {keys.DONE, keys.TERMINATED, keys.TRUNCATED}
         return {name: beside.union(spec.keys()) for name, spec in self.observation_spec.items()}
 

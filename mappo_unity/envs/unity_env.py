@@ -183,6 +183,7 @@ class UnityEnv(EnvBase):
                 )
             # only now, as it forgets the order of the requests
             behavior.begin_round()
+            behavior.returns.round = self.rounds
 
         self._untouched = False
         self._play_until_asked()

@@ -164,7 +164,7 @@ class CheckpointPolicy(ActorPolicy):
 
     def __init__(self, path: Path, deterministic: bool) -> None:
         state = checkpoint.load(path)
-        actors = {name: _actor(state, name) for name in state["layout"]}
+        actors = {name: actor_of(state, name) for name in state["layout"]}
         super().__init__(state["layout"], actors, deterministic, f"checkpoint {path}")
         self.path = path
         self.agent_steps = int(state["agent_steps"])
@@ -196,7 +196,8 @@ def _spread(rows: np.ndarray, places: Places) -> torch.Tensor:
     return torch.from_numpy(out)
 
 
-def _actor(state: dict[str, Any], name: str) -> Any:
+def actor_of(state: dict[str, Any], name: str) -> Any:
+    """Return the actor of a policy name that a loaded checkpoint holds."""
     layout, model = state["layout"][name], model_from_saved(state["model"][name])
     actions = ActionLayout.from_spec(
         ActionSpec(layout["continuous"], tuple(layout["branches"])), model.flatten_branches

@@ -31,7 +31,17 @@ from mappo_unity.runs.checkpoint_file import (
     unreadable,
 )
 
-__all__ = ["BEST", "FOLDER", "CheckpointError", "checkpoints_in", "load", "newest_good", "save", "save_in"]
+__all__ = [
+    "BEST",
+    "FOLDER",
+    "NAME",
+    "CheckpointError",
+    "checkpoints_in",
+    "load",
+    "newest_good",
+    "save",
+    "save_in",
+]
 
 
 def save(path: Path, state: dict[str, Any]) -> None:

@@ -31,6 +31,13 @@ def checkpoints_in(folder: Path) -> list[Path]:
     return sorted(p for p in (folder / FOLDER).glob("step_*.pt") if _PATTERN.fullmatch(p.name))
 
 
+def step_of(path: Path) -> int:
+    """Return the agent decisions that the name of a numbered checkpoint tells."""
+    found = _PATTERN.fullmatch(path.name)
+    assert found is not None, path
+    return int(found[1])
+
+
 def read_plain(path: Path) -> dict[str, Any]:
     """Return a checkpoint's entries; a stand-in for each tensor.
 

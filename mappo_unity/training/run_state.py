@@ -18,7 +18,7 @@ from mappo_unity.policies.export import sample_inputs
 from mappo_unity.policies.layouts import guessed_otherwise, without_channels
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
-from mappo_unity.training.batches import Batch, BatchCollector
+from mappo_unity.training.collection.batches import Batch, BatchCollector
 from mappo_unity.training.episode_stats import RecentEpisodes
 from mappo_unity.training.match_series import MatchSeries
 from mappo_unity.training.resume_check import (
@@ -27,6 +27,7 @@ from mappo_unity.training.resume_check import (
     describe_models,
     describe_policies,
 )
+from mappo_unity.training.self_play.self_play import SelfPlay
 from mappo_unity.training.setup import TrainingSetup
 
 _COUNTERS = (
@@ -46,7 +47,8 @@ class RunState:
     Attributes: `iteration`, how many are complete; `agent_steps`, agent decisions; `wall_s`, seconds spent
     collecting and learning; `saved_at`, agent decisions at the last regular checkpoint; `best_score`, of the
     best checkpoint; `dropped_episodes` and `dropped_steps`, what crashed players cost; `samples`, inputs of
-    each policy that an export is compared on.
+    each policy that an export is compared on; `self_play`, the opponents, where there are some; `notes`,
+    lines for the user about what a checkpoint could not give back.
     """
 
     def __init__(self, cfg: Config, folder: Path, setup: TrainingSetup) -> None:
@@ -58,6 +60,8 @@ class RunState:
         self.recent_episodes = RecentEpisodes(cfg.log.return_window, list(setup.env.behaviors))
         self.matches = MatchSeries(cfg, folder, setup.env.behaviors)
         self.lessons = setup.lessons
+        self.self_play = SelfPlay(cfg, folder, setup) if setup.opponents is not None else None
+        self.notes: list[str] = []  # about what a checkpoint could not give back
         self.samples: dict[str, dict[str, torch.Tensor]] = {}
         self._restarts_here = 0
         self._rng_state: dict[str, Any] | None = None  # of the checkpoint that is resumed
@@ -130,6 +134,21 @@ class RunState:
         self.best_score = -math.inf
         return [f"{self.agent_steps:,} steps: {change}" for change in changes]
 
+    def begin(self) -> None:
+        """Do what a run begins with when nothing can be refused any more."""
+        if self.self_play is not None:
+            self.self_play.begin(self._about())
+
+    def advance_self_play(self, batch: Batch, batches: BatchCollector) -> dict[str, float]:
+        """Count what opponents did in a batch, and choose those of the next ones; return metrics."""
+        if self.self_play is None:
+            return {}
+        metrics, is_reset = self.self_play.advance(batch, self.agent_steps, self._about())
+        if is_reset:
+            batches.restart()
+            self.setup.forget_pending()
+        return metrics
+
     def play_matches(self) -> dict[str, float]:
         """Play a series of matches where one is due, and return its figures."""
         if not self.matches.is_due(self.agent_steps):
@@ -155,16 +174,14 @@ class RunState:
     def state_dict(self) -> dict[str, Any]:
         """Return everything that resuming needs, between two iterations; what is trained is copied."""
         learners = {name: learner.state_dict() for name, learner in self.setup.learners.items()}
-        return {
-            "env_name": self.cfg.env.name,
-            "model": self._models(),
-            "layout": self._layout(),
+        self_play = self.self_play.state_dict() if self.self_play is not None else None
+        return self._about() | {
             "learners": copy.deepcopy(learners),
+            "self_play": self_play,
             "env": self.setup.env.get_state(),
             "memories": {name: memory.clone() for name, memory in self.setup.policy.memories.items()},
             "window": self.recent_episodes.state_dict(),
             "matches": self.matches.state_dict(),
-            "lessons": self.lessons.state_dict(),
             "rng": get_rng_state(),
             "samples": self.samples,
             **{name: getattr(self, name) for name in _COUNTERS},
@@ -196,6 +213,9 @@ class RunState:
 
         self.recent_episodes.load_state_dict(state["window"])
         self.matches.load_state_dict(state["matches"])
+        # a run may take up self-play, or leave it, when it is resumed
+        if self.self_play is not None and state.get("self_play") is not None:
+            self.self_play.load_state_dict(state["self_play"], self.notes.append)
         for name in _COUNTERS:
             setattr(self, name, state[name])
         self.best_score = self.matches.comparable(self.best_score, state["matches"])
@@ -229,6 +249,15 @@ class RunState:
             self.setup.env.set_parameter(name, value)
         if is_new and changed:  # its first episodes began with the first lessons
             self.setup.env.restart()
+
+    def _about(self) -> dict[str, Any]:
+        """Return what a file needs beside networks to be played."""
+        return {
+            "env_name": self.cfg.env.name,
+            "model": self._models(),
+            "layout": self._layout(),
+            "lessons": self.lessons.state_dict(),
+        }
 
     def _layout(self) -> dict[str, Any]:
         # networks that guess their channels stay those of a checkpoint that does not tell

@@ -8,37 +8,30 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from mlagents_envs.base_env import BehaviorSpec, ObservationSpec
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType
 
-from mappo_unity.config.per_behavior import TRAIN, behavior_config, check_behaviors, is_frozen
-from mappo_unity.config.schema import CollectConfig, Config, CriticKind, PPOConfig
+from mappo_unity.config.per_behavior import TRAIN, is_frozen
+from mappo_unity.config.schema import CollectConfig, Config
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.envs.following import followed
-from mappo_unity.envs.replay import make_replay_function, read_fitting
+from mappo_unity.envs.replay import make_replay_function
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.imitation.cloning import Cloning
-from mappo_unity.learning.imitation.expert import Expert, make_expert
-from mappo_unity.learning.networks.actor_critic import JointPolicy, make_actor, make_critic
-from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
-from mappo_unity.learning.networks.encoders import ObsLayout
-from mappo_unity.learning.networks.images import check_sides
-from mappo_unity.learning.ppo import PolicyLearner
-from mappo_unity.learning.rewards.streams import RewardStreams, make_intrinsic
+from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT
+from mappo_unity.learning.networks.joint_policy import JointPolicy
+from mappo_unity.learning.networks.opponents import Opponents
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
-from mappo_unity.scenes.contract.images import looks_unmarked
-from mappo_unity.training.batches import Batch, BatchCollector, count_decisions, count_present
+from mappo_unity.training.collection.batches import Batch, BatchCollector, count_decisions, count_present
+from mappo_unity.training.learners import make_learners
 from mappo_unity.training.lessons.curriculum import lessons_of
-from mappo_unity.training.memory import check_batch_memory, check_network_memory
 
 
 class TrainingSetup:
@@ -49,8 +42,9 @@ class TrainingSetup:
         env: the environment, open.
 
     Attributes: `learners` by policy name; `policy`, their actors as one; `lessons` of environment parameters;
-    `notes`, lines for the user; `frozen`, the policy names that only play; `guesses_channels`, whether
-    `guess_channels` built the networks.
+    `notes`, lines for the user; `frozen`, the policy names that only play; `opponents`, who plays some of the
+    teams instead of the learners, with self-play; `guesses_channels`, whether `guess_channels` built the
+    networks.
 
     Raises:
         ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
@@ -62,6 +56,7 @@ class TrainingSetup:
         self.lessons = lessons_of(cfg.env, env)
         self.notes += self.lessons.notes
 
+        self.opponents = Opponents() if cfg.self_play.is_on else None
         self.guesses_channels = False
         self._make_learners(self.notes.append)
         if len(self.frozen) == len(self.learners):
@@ -78,7 +73,8 @@ class TrainingSetup:
     def _make_learners(self, note: Callable[[str], None]) -> None:
         rounds = batch_rounds(self.cfg.collect, self.env)
         self.learners = make_learners(self.cfg, self.env, rounds, note, self.guesses_channels)
-        self.policy = JointPolicy({name: learner.actor for name, learner in self.learners.items()})
+        actors = {name: learner.actor for name, learner in self.learners.items()}
+        self.policy = JointPolicy(actors, self.opponents)
 
         self.frozen = {name for name in self.learners if is_frozen(self.cfg, name)}
         for name in self.frozen:
@@ -91,7 +87,7 @@ class TrainingSetup:
         env = followed(self.env, keeps_ends)
         collector = make_collector(env, self.policy, device=self.cfg.device)
         try:
-            yield BatchCollector(collector, self.env, self.cfg.collect)
+            yield BatchCollector(collector, self.env, self.cfg.collect, self.opponents)
         finally:
             # `set_up` opened the environment, and closes it
             collector.shutdown(close_env=False)
@@ -201,100 +197,3 @@ def make_collector(env: EnvBase, policy: JointPolicy, rounds: int = 1, device: s
         auto_register_policy_transforms=False,
         **({} if device == "cpu" else devices),
     )
-
-
-def make_learners(
-    cfg: Config,
-    env: UnityEnv,
-    rounds: int,
-    note: Callable[[str], None],
-    guess_channels: bool = False,
-) -> dict[str, PolicyLearner]:
-    """Build networks and learner of every policy name.
-
-    Args:
-        cfg: the run's options.
-        env: what is played.
-        rounds: of a batch.
-        note: takes a line for the user about an option that does not fit and follows another, or about an
-            image that says nothing of its channels.
-        guess_channels: see `ObsLayout.from_shapes`.
-
-    Raises:
-        ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
-    """
-    check_behaviors(cfg, env.sides)
-    check_batch_memory(cfg, env, rounds)
-
-    learners = {}
-    for name, sides in env.sides.items():
-        model, ppo, *_ = behavior_config(cfg, name)
-        behavior = env.behaviors[sides[0]]
-        # sides that share a policy are stacked: all their teams are rows of its batch
-        teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
-        check_minibatches(name, ppo, rounds, teams, team_size, note)
-
-        sensors = behavior.spec.observation_specs
-        obs = ObsLayout.from_specs(sensors)
-        if guess_channels:
-            obs = ObsLayout.from_shapes([sensor.shape for sensor in sensors])
-        note_unmarked(name, sensors, note)
-        check_sides(name, sensors, model.image_encoder)
-        layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
-        check_network_memory(name, obs, layout, team_size, model)
-
-        # Built after the check, so that what does not fit is refused by a line of ours.
-        learners[name] = _make_learner(cfg, name, obs, layout, team_size, behavior.spec)
-
-    return learners
-
-
-def _make_learner(
-    cfg: Config, name: str, obs: ObsLayout, layout: ActionLayout, team_size: int, spec: BehaviorSpec
-) -> PolicyLearner:
-    model, ppo, rewards, bc = behavior_config(cfg, name)
-    actor = make_actor(obs, layout, team_size, model).to(cfg.device)
-
-    def expert(demos: list[str]) -> Expert:
-        return make_expert(read_fitting(demos, spec, name), obs.keys, cfg.device)
-
-    # a value for each stream of rewards
-    judged = expert(rewards.gail.demos) if rewards.gail.strength else None
-    intrinsic = make_intrinsic(obs, layout, rewards, cfg.device, judged)
-    critic = make_critic(obs, team_size, model, layout, 1 + len(intrinsic)).to(cfg.device)
-    shares = model.critic is CriticKind.poca and team_size > 1
-    streams = RewardStreams(ppo, rewards, intrinsic, obs.keys, shares)
-
-    share = bc.steps / cfg.max_steps if bc.steps else None
-    cloning = Cloning(actor, expert(bc.demos), bc, ppo, share) if bc.demos else None
-    return PolicyLearner(actor, critic, ppo, streams, cloning)
-
-
-def note_unmarked(name: str, sensors: Sequence[ObservationSpec], note: Callable[[str], None]) -> None:
-    """Note images that mark no dimension, are taken for ``C, H, W``, and look like ``H, W, C``."""
-    for sensor in filter(looks_unmarked, sensors):
-        channels, height, width = sensor.shape
-        note(
-            f"note: sensor {sensor.name!r} of {name} has shape {tuple(sensor.shape)} and marks no "
-            f"dimensions: it is taken for {channels} channels of {height} x {width}; mark height and width "
-            "with dimension_property where that is not so"
-        )
-
-
-def check_minibatches(
-    name: str, ppo: PPOConfig, rounds: int, teams: int, team_size: int, note: Callable[[str], None]
-) -> None:
-    """Note a minibatch larger than the batch; raise ConfigError for more minibatches than team rows."""
-    rows, agents = rounds * teams, teams * team_size
-    if (ppo.num_minibatches or 0) > rows:
-        raise ConfigError(
-            f"ppo.num_minibatches={ppo.num_minibatches} is larger than the batch of {name!r}: {rounds} "
-            f"rounds x {teams} teams = {rows} team rows; lower ppo.num_minibatches, or raise "
-            "collect.batch_size (or collect.rounds, where it is given)"
-        )
-
-    if ppo.num_minibatches is None and ppo.minibatch_size > rows * team_size:
-        note(
-            f"note: ppo.minibatch_size={ppo.minibatch_size} is larger than the batch of {name}: {rounds} "
-            f"rounds x {agents} agents = {rows * team_size} decisions, learnt as one minibatch"
-        )

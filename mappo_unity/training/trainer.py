@@ -20,7 +20,7 @@ from mappo_unity.policies.export import RunExports
 from mappo_unity.policies.warm_start.start import warm_start
 from mappo_unity.runs.logger import RunLog
 from mappo_unity.signals import Interrupted
-from mappo_unity.training.batches import BatchCollector
+from mappo_unity.training.collection.batches import BatchCollector
 from mappo_unity.training.episode_stats import by_policy
 from mappo_unity.training.memory import is_out_of_memory
 from mappo_unity.training.outcome import DIVERGED, FINISHED, INTERRUPTED, SOLVED, Outcome, why_over
@@ -69,7 +69,7 @@ def train(
         with RunLog(cfg.log, folder, cfg.max_steps, resume_steps, console) as log:
             # not before: until here something may be refused
             log.message(f"run folder: {folder}" if resume_from is None else f"resuming from {resume_from}")
-            for note in setup.notes + started:
+            for note in setup.notes + state.notes + started:
                 log.message(note)
             exports = RunExports(folder, log.message) if cfg.export_onnx else None
             saver = CheckpointSaver(cfg, folder, state, exports, resume_from)
@@ -77,6 +77,7 @@ def train(
 
             with setup.collecting() as batches, stop.taken():
                 state.restore_rng()
+                state.begin()
                 try:
                     status = _iterate(cfg, batches, state, saver, log, stop, after_iteration)
                     saver.finish()
@@ -112,6 +113,7 @@ def _iterate(
         row = state.count(batch, collect_s=collected_s - started_s, update_s=learned_s - collected_s)
         row |= crashed | by_policy(learned)
         new_lessons = state.advance_lessons(batch, batches)
+        row |= state.advance_self_play(batch, batches)
         statistics = batch.statistics
         del batch  # the next one is collected without it
         saver.complete()  # whatever happens from here on, this iteration is saved

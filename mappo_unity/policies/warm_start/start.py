@@ -9,24 +9,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from mappo_unity.config.option_table import show_value
 from mappo_unity.config.per_behavior import init_source
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.networks.actor_critic import PerMember
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.value_norm import by_stream
 from mappo_unity.policies.policy_files import Kind, choose_checkpoint
-from mappo_unity.policies.warm_start.agreement import check_agreement
-from mappo_unity.policies.warm_start.from_onnx import actor_tensors
+from mappo_unity.policies.warm_start.actors import copy_network
 from mappo_unity.policies.warm_start.onnx_network import read_network
 from mappo_unity.policies.warm_start.sources import find_source
 from mappo_unity.policies.warm_start.tensors import Row, copy_fitting, table
 from mappo_unity.runs import checkpoint
-
-NETWORK = "module.0.module."  # names of an actor's network in the actor's state_dict
 
 
 def warm_start(
@@ -70,23 +64,10 @@ def warm_start(
 
 def _from_onnx(path: Path, learner: PolicyLearner, layout: Mapping[str, Any]) -> tuple[str, list[Row]]:
     network = read_network(path)
-    net: Any = learner.actor[0].module
-    # a network for each member of a team: all of them begin alike
-    members = (
-        {f"nets.{i}.": member for i, member in enumerate(net.nets)} if isinstance(net, PerMember) else {}
-    )
+    rows, error = copy_network(network, learner.actor, layout["sensors"])
 
-    tensors: dict[str, torch.Tensor] = {}
-    misfits: dict[str, str] = {}
-    for prefix, member in (members or {"": net}).items():
-        own, why = actor_tensors(network, member, layout["sensors"])
-        tensors |= {NETWORK + prefix + n: torch.tensor(values) for n, values in own.items()}
-        misfits |= {NETWORK + prefix + n: reason for n, reason in why.items()}
-
-    rows = copy_fitting(learner.actor, "actor", tensors, misfits)
     told = f"{path}, whose network has {_show(network.options)}"
-    if not any(row.reason for row in rows):
-        error = max(check_agreement(network, m, layout["sensors"]) for m in (members or {"": net}).values())
+    if error is not None:
         told += f"; on random observations its actions differ from onnxruntime's by {error:.1e}"
     return told, [*rows, Row("critic", None, "an ONNX file holds none: a new one learns")]
 

@@ -14,8 +14,10 @@ from mappo_unity import keys
 from mappo_unity.config.schema import CollectConfig
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.learning.networks.opponents import Opponents
 from mappo_unity.scenes.contract.statistics import Statistics
-from mappo_unity.training.crashed_episodes import mask_crashed_episodes
+from mappo_unity.training.collection.crashed_episodes import mask_crashed_episodes
+from mappo_unity.training.collection.results import Result, count_learning, split_episodes
 
 
 @dataclass
@@ -31,6 +33,7 @@ class Batch:
         statistics: what the environment reported of itself, see `UnityEnv.pop_statistics`.
         restarts: how often players have been started again so far; None: there are no players.
         dropped_episodes, dropped_steps: what crashes cost in this batch.
+        results: how opponents fared against those who learn, with self-play.
     """
 
     rounds: TensorDictBase
@@ -41,6 +44,7 @@ class Batch:
     restarts: int | None = None
     dropped_episodes: int = 0
     dropped_steps: int = 0
+    results: list[Result] = field(default_factory=list)
 
     def of(self, name: str) -> tuple[TensorDictBase, TensorDictBase]:
         """Return one policy name's entries ``[T, ..., A]`` with its own ``next``, and what followed them."""
@@ -60,10 +64,13 @@ class BatchCollector:
         collector: plays rounds of a `FollowedEnv`.
         env: what is played, below the collector's transforms.
         cfg: how large a batch is.
+        opponents: who plays some of the teams instead of the learners; None: nobody does.
     """
 
-    def __init__(self, collector: Collector, env: UnityEnv, cfg: CollectConfig) -> None:
-        self._collector, self._env, self._cfg = collector, env, cfg
+    def __init__(
+        self, collector: Collector, env: UnityEnv, cfg: CollectConfig, opponents: Opponents | None = None
+    ) -> None:
+        self._collector, self._env, self._cfg, self._opponents = collector, env, cfg, opponents
 
     def __iter__(self) -> Iterator[Batch]:
         return self
@@ -87,6 +94,14 @@ class BatchCollector:
         self._env.restart()
         self._collector.reset_at_each_iter = True  # hands out what the reset has brought
 
+    def _count_learning(self) -> int:
+        """Return how many agents are there now that the learners play."""
+        return (
+            count_present(self._env)
+            if self._opponents is None
+            else count_learning(self._env, self._opponents)
+        )
+
     def _play(self, rounds: int) -> TensorDictBase:
         self._collector.frames_per_batch = self._collector.requested_frames_per_batch = rounds
         # not through its iterator, which would hold this batch while it collects the next
@@ -101,7 +116,12 @@ class BatchCollector:
         device = rounds.get((next(iter(env.sides)), keys.ACTING)).device
         following = {name: part.to(device) for name, part in following.items()}
         statistics = env.pop_statistics()
-        batch = Batch(rounds, following, env.pop_episodes(), statistics=statistics, restarts=env.restarts)
+        episodes, results = env.pop_episodes(), list[Result]()
+        if self._opponents is not None:
+            episodes, results = split_episodes(episodes, rounds, env)
+        batch = Batch(
+            rounds, following, episodes, statistics=statistics, restarts=env.restarts, results=results
+        )
         if env.restarts is None:
             return batch
 

@@ -1,0 +1,255 @@
+"""Self-play: who opposes the learners, what joins the pool, and the Elo ratings of all.
+
+The semantics and names are ML-Agents' (mlagents/trainers/ghost), but for what docs/self-play.md says. An Elo
+rating moves by ``S - E`` points with each result S, where ``E = 1 / (1 + 10^((R_opponent - R) / 400))`` is
+what was to be expected (K = 1), and the opponent's by as much the other way.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mappo_unity import keys
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
+from mappo_unity.learning.networks.opponents import Draws, Opponents
+from mappo_unity.policies.layouts import sides_of
+from mappo_unity.policies.league.ratings import expected
+from mappo_unity.training.collection.batches import Batch
+from mappo_unity.training.episode_stats import by_policy
+from mappo_unity.training.self_play.draw import LATEST, draw_teams
+from mappo_unity.training.self_play.fixed import load_fixed
+from mappo_unity.training.self_play.pool import Pool, Record
+from mappo_unity.training.setup import TrainingSetup
+
+ELO = "Self-play/ELO"  # the metric, as ML-Agents calls it
+
+
+class SelfPlay:
+    """The opponents of a run.
+
+    Args:
+        cfg: the run's options.
+        folder: the run's folder.
+        setup: what is trained.
+
+    Attributes: `elo`, the ratings of the policy names that learn.
+
+    Raises:
+        ConfigError: there are not two sides, or a fixed opponent cannot be loaded.
+    """
+
+    def __init__(self, cfg: Config, folder: Path, setup: TrainingSetup) -> None:
+        self._cfg, self._setup = cfg.self_play, setup
+        self._seed, self._device = cfg.seed, cfg.device
+        self._sides = _two_sides(cfg, setup)
+        self._names = [name for name in setup.learners if name not in setup.frozen]
+        assert setup.opponents is not None
+        self._opponents: Opponents = setup.opponents
+
+        self._pool = Pool(folder, self._cfg.window)
+        self._fixed = self._load_fixed()
+        self.elo = dict.fromkeys(self._names, self._cfg.initial_elo)
+        self._records: dict[str, dict[int, Record]] = {
+            name: {number: Record(self._cfg.initial_elo) for number in self._fixed} for name in self._names
+        }
+        self._saved_at = self._drawn_at = self._changed_at = 0
+        self._draws = 0
+        self._learning = None if self._cfg.team_change is None else min(self._sides)
+
+    def begin(self, about: Mapping[str, Any]) -> None:
+        """Take the first snapshot and draw opponents, where a run begins.
+
+        Args:
+            about: what a snapshot's file needs beside networks to be played.
+        """
+        if self._draws == 0:
+            self._save(0, about)
+            self._draw()
+
+    def advance(
+        self, batch: Batch, agent_steps: int, about: Mapping[str, Any]
+    ) -> tuple[dict[str, float], bool]:
+        """Count a batch's results, take a snapshot and draw opponents where it is time.
+
+        Args:
+            batch: what was collected and learnt.
+            agent_steps: agent decisions of the run with it.
+            about: as for `begin`.
+
+        Returns:
+            Metrics, and whether the other side learns from now on: the environment is to be reset.
+        """
+        metrics = self._count(batch)
+        cfg = self._cfg
+
+        if cfg.save_steps is not None and agent_steps - self._saved_at >= cfg.save_steps:
+            self._save(agent_steps, about)
+        changed = cfg.team_change is not None and agent_steps - self._changed_at >= cfg.team_change
+        if changed:
+            order = sorted(self._sides)
+            self._learning = next(side for side in order if side != self._learning)
+            self._changed_at = agent_steps
+        if changed or agent_steps - self._drawn_at >= cfg.swap_steps:
+            self._drawn_at = agent_steps
+            self._draw()
+        return metrics, changed
+
+    # --- results
+
+    def _count(self, batch: Batch) -> dict[str, float]:
+        """Move the ratings by a batch's results; return metrics."""
+        points = {name: list[float]() for name in self._names}
+        for result in batch.results:
+            if result.opponent == LATEST:
+                continue  # against its own weights a rating cannot move
+            record = self._records[keys.policy_name(result.behavior)].get(result.opponent)
+            if record is None:
+                continue  # it has left the pool
+            record.add(result.score)
+            for name in self._rivals(result.behavior):
+                gain = (1 - result.score) - expected(self.elo[name], record.elo)
+                self.elo[name] += gain
+                record.elo -= gain
+                points[name].append(1 - result.score)
+
+        size = float(len(self._pool.numbers) + len(self._fixed))
+        return by_policy(
+            {
+                name: {ELO: self.elo[name], "points_vs_pool": _mean(points[name]), "pool_size": size}
+                for name in self._names
+            }
+        )
+
+    def _rivals(self, behavior: str) -> list[str]:
+        """Return the policy names that learn on the other side."""
+        others = [b for side, own in self._sides.items() if behavior not in own for b in own]
+        return [name for name in self._names if name in {keys.policy_name(other) for other in others}]
+
+    # --- the pool
+
+    def _save(self, agent_steps: int, about: Mapping[str, Any]) -> None:
+        self._saved_at = agent_steps
+        if self._cfg.save_steps is None:
+            return
+        learners = self._setup.learners
+        number = self._pool.add(
+            agent_steps, {name: learner.actor.state_dict() for name, learner in learners.items()}, about
+        )
+        for name in self._names:
+            self._records[name][number] = Record(self.elo[name])
+            for old in self._records[name].keys() - {*self._pool.numbers, *self._fixed}:
+                del self._records[name][old]
+
+    def _draw(self) -> None:
+        """Say who plays each team from its next episode on."""
+        env = self._setup.env
+        rng = np.random.default_rng([self._seed, self._draws])
+        self._draws += 1
+        teams = {behavior: state.slots.num_teams for behavior, state in env.behaviors.items()}
+        records = {behavior: self._records.get(keys.policy_name(behavior), {}) for behavior in teams}
+        players = draw_teams(rng, self._cfg, self._sides, teams, records, self._learning)
+
+        used: set[int] = set()
+        for name, sides in env.sides.items():
+            plan = torch.from_numpy(np.stack([players[side] for side in sides])).to(self._device)
+            self._opponents.plan(name, plan if len(sides) > 1 else plan[0])
+            self._opponents.retire(name)
+            self._load_actors(name)
+            used |= self._opponents.used(name)
+        self._pool.clean(used)
+
+    def _load_actors(self, name: str) -> None:
+        """Build the networks of the opponents of a policy name that play, or will."""
+        known = self._opponents.actors.setdefault(name, {})
+        for number in self._opponents.used(name) - known.keys():
+            known[number] = self._make_actor(name, number)
+
+    def _make_actor(self, name: str, number: int) -> Draws:
+        learner = self._setup.learners[name].actor
+        if number == LATEST:
+            return learner
+        if number in self._fixed:
+            return self._fixed[number][name]
+
+        actor = copy.deepcopy(learner)
+        actor.keeps_components = False
+        actor.load_state_dict(self._pool.tensors(number, name))
+        return actor.eval()
+
+    def _load_fixed(self) -> dict[int, dict[str, Draws]]:
+        env, learners = self._setup.env, self._setup.learners
+        specs = {sides[0]: env.behaviors[sides[0]].spec for n, sides in env.sides.items() if n in self._names}
+        actors = {name: learner.actor for name, learner in learners.items()}
+        fixed = [load_fixed(where, specs, actors, self._device) for where in self._cfg.fixed]
+        return {LATEST - 1 - index: players for index, players in enumerate(fixed)}
+
+    # --- checkpoints
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what resuming needs; snapshots by reference to their files."""
+        records = {
+            name: [[number, record.elo, record.lost, record.played] for number, record in known.items()]
+            for name, known in self._records.items()
+        }
+        return {
+            "pool": self._pool.state_dict(),
+            "opponents": self._opponents.state_dict(),
+            "fixed": list(self._cfg.fixed),
+            "records": records,
+            "elo": dict(self.elo),
+            "learning": self._learning,
+            "draws": self._draws,
+            "at": [self._saved_at, self._drawn_at, self._changed_at],
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any], say: Callable[[str], None]) -> None:
+        """Restore what `state_dict` returned.
+
+        Args:
+            say: takes a line about each opponent that is left out.
+
+        Raises:
+            ConfigError: a snapshot's file is missing or damaged, or the fixed opponents are others.
+        """
+        if list(state["fixed"]) != list(self._cfg.fixed):
+            raise ConfigError(
+                f"self_play.fixed={list(self._cfg.fixed)} cannot change with resume: the run has "
+                f"{list(state['fixed'])}"
+            )
+        self._opponents.load_state_dict(state["opponents"], self._device)
+        used = {number for name in self._names for number in self._opponents.used(name)}
+        self._pool.load_state_dict(state["pool"], used, self._cfg.skip_missing, say)
+        self._draws = int(state["draws"])
+        self._saved_at, self._drawn_at, self._changed_at = (int(at) for at in state["at"])
+        self.elo |= {name: float(elo) for name, elo in state["elo"].items() if name in self.elo}
+        if self._learning is not None and state["learning"] is not None:
+            self._learning = int(state["learning"])
+
+        there = {*self._pool.numbers, *self._fixed}
+        for name in self._names:
+            rows = state["records"].get(name, [])
+            self._records[name] = {int(n): Record(*values) for n, *values in rows if n in there}
+            self._opponents.replace(name, self._pool.all_numbers | {*self._fixed, LATEST})
+            self._load_actors(name)
+
+
+def _two_sides(cfg: Config, setup: TrainingSetup) -> dict[int, list[str]]:
+    sides = sides_of(setup.env.behaviors)
+    if len(sides) != 2:
+        raise ConfigError(
+            f"self_play.save_steps={cfg.self_play.save_steps} self_play.fixed={list(cfg.self_play.fixed)}: "
+            f"self-play needs an environment with two sides (team ids), and {cfg.env.name} has "
+            f"{len(sides)}: {', '.join(setup.env.behaviors)}"
+        )
+    return sides
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")
