@@ -20,6 +20,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.runs.checkpoint_file import (
     BEST,
     FOLDER,
+    POOL,
     CheckpointError,
     checkpoints_in,
     newest_good,
@@ -80,6 +81,11 @@ def check_resumable(path: Path, option: str) -> None:
         raise ConfigError(f"{option}={path} is a folder of ONNX files: {option} takes {wanted}")
 
     if _kind_of_file(path, option, wanted) is Kind.checkpoint:
+        if option == "resume" and path.parent.name == POOL:
+            raise ConfigError(
+                f"{option}={path} is an opponent of a run's pool: it holds a policy, but not what resuming needs "
+                f"(optimizer, counters, critic); its run: {shell_argument(option, path.parent.parent)}"
+            )
         return
 
     # An ONNX file in the folder of a run: that run can be named instead.

@@ -17,6 +17,7 @@ from mappo_unity.errors import ConfigError
 
 FORMAT = 2
 FOLDER = "checkpoints"
+POOL = "pool"  # the folder of past policies that only play, see `training.self_play`
 BEST = "best.pt"
 NAME = "step_{:012d}.pt"
 _PATTERN = re.compile(r"step_(\d{12})\.pt")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from mappo_unity.config.schema import OpponentDraw, SelfPlayConfig
-from mappo_unity.keys import LEARNER
+from mappo_unity.keys import LEARNER, policy_name
 from mappo_unity.training.self_play.pool import Record
 
 LATEST = -2
@@ -41,26 +41,26 @@ def draw_teams(
     learns = order[rng.integers(0, len(order), count)] if learning is None else np.full(count, learning)
 
     players: dict[str, np.ndarray] = {}
+    met: dict[str, np.ndarray] = {}  # by policy name: what both its sides meet is one forward pass
     for side in order:
         for behavior in sides[int(side)]:
             everybody = np.full(count, LEARNER)
             if records[behavior]:
-                drawn = _draw(rng, cfg, records[behavior], count)
-                everybody = np.where(latest, LEARNER if learning is None else LATEST, drawn)
+                name = policy_name(behavior)
+                if name not in met:
+                    met[name] = _draw(rng, cfg, records[behavior])
+                past = rng.choice(met[name], count)
+                everybody = np.where(latest, LEARNER if learning is None else LATEST, past)
                 everybody[learns == side] = LEARNER
             players[behavior] = everybody[: teams[behavior]].astype(np.int64)
     return players
 
 
-def _draw(
-    rng: np.random.Generator, cfg: SelfPlayConfig, records: Mapping[int, Record], count: int
-) -> np.ndarray:
-    """Return an opponent for each of so many teams; at most `num_opponents` different ones."""
+def _draw(rng: np.random.Generator, cfg: SelfPlayConfig, records: Mapping[int, Record]) -> np.ndarray:
+    """Return `num_opponents` numbers; one that is drawn twice is met twice as often."""
     numbers = np.array(sorted(records))
     weights = np.ones(len(numbers))
     if cfg.opponents is OpponentDraw.hardest:
         # prioritised fictitious self-play: O. Vinyals et al., Nature 575, 2019, p. 350-354
         weights = np.array([(1 - records[number].share_lost) ** 2 for number in numbers.tolist()])
-
-    met = rng.choice(numbers, cfg.num_opponents, p=weights / weights.sum())
-    return rng.choice(met, count)
+    return rng.choice(numbers, cfg.num_opponents, p=weights / weights.sum())

@@ -16,9 +16,8 @@ import torch
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs import checkpoint
-from mappo_unity.runs.checkpoint_file import CheckpointError, step_of
+from mappo_unity.runs.checkpoint_file import POOL, CheckpointError, step_of
 
-FOLDER = "pool"
 _FORGET = 200.0  # results after which older ones count half, so that a share won is of recent matches
 
 Tensors = dict[str, torch.Tensor]
@@ -100,7 +99,7 @@ class Pool:
             CheckpointError: the file cannot be written.
         """
         copies = {name: {k: v.detach().cpu().clone() for k, v in a.items()} for name, a in actors.items()}
-        path = self._folder / FOLDER / checkpoint.NAME.format(steps)
+        path = self._folder / POOL / checkpoint.NAME.format(steps)
         if not self._folder.is_dir():
             raise CheckpointError(f"the run folder {self._folder} was removed while the run was training")
         learners = {name: {"actor": tensors} for name, tensors in copies.items()}
@@ -123,7 +122,7 @@ class Pool:
             dropped_at = snapshot.dropped_at
             if dropped_at is None or snapshot.number in used or not kept or kept[0] < dropped_at:
                 continue
-            (self._folder / FOLDER / snapshot.file).unlink(missing_ok=True)
+            (self._folder / POOL / snapshot.file).unlink(missing_ok=True)
             self._snapshots.remove(snapshot)
 
     def state_dict(self) -> dict[str, Any]:
@@ -152,7 +151,7 @@ class Pool:
         for known in state["snapshots"]:
             snapshot = Snapshot(**known)
             needed = snapshot.dropped_at is None or snapshot.number in used
-            path = self._folder / FOLDER / snapshot.file
+            path = self._folder / POOL / snapshot.file
             try:
                 if needed:
                     snapshot.actors = _read(path, snapshot.checksum)
