@@ -83,8 +83,8 @@ def check_resumable(path: Path, option: str) -> None:
     if _kind_of_file(path, option, wanted) is Kind.checkpoint:
         if option == "resume" and path.parent.name == POOL:
             raise ConfigError(
-                f"{option}={path} is an opponent of a run's pool: it holds a policy, but not what resuming needs "
-                f"(optimizer, counters, critic); its run: {shell_argument(option, path.parent.parent)}"
+                f"{option}={path} is an opponent of a run's pool: it holds a policy, but not what resuming "
+                f"needs (optimizer, counters, critic); its run: {shell_argument(option, path.parent.parent)}"
             )
         return
 
