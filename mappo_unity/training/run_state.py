@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import sample_inputs
 from mappo_unity.policies.layouts import guessed_otherwise, without_channels
+from mappo_unity.policies.policy import Policy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
 from mappo_unity.training.batches import Batch, BatchCollector
@@ -45,8 +47,8 @@ class RunState:
 
     Attributes: `iteration`, how many are complete; `agent_steps`, agent decisions; `wall_s`, seconds spent
     collecting and learning; `saved_at`, agent decisions at the last regular checkpoint; `best_score`, of the
-    best checkpoint; `dropped_episodes` and `dropped_steps`, what crashed players cost; `samples`, inputs of
-    each policy that an export is compared on.
+    best checkpoint, which matches choose without it; `dropped_episodes` and `dropped_steps`, what crashed
+    players cost; `samples`, inputs of each policy that an export is compared on.
     """
 
     def __init__(self, cfg: Config, folder: Path, setup: TrainingSetup) -> None:
@@ -128,27 +130,36 @@ class RunState:
             self.setup.forget_pending()
         self.recent_episodes.forget()
         self.best_score = -math.inf
+        self.matches.forget()
         return [f"{self.agent_steps:,} steps: {change}" for change in changes]
 
-    def play_matches(self) -> dict[str, float]:
-        """Play a series of matches where one is due, and return its figures."""
+    def play_matches(self, opponents: Mapping[str, Policy] | None = None) -> dict[str, float]:
+        """Play a series of matches where one is due, and return its figures.
+
+        Args:
+            opponents: see `MatchSeries.play`.
+        """
         if not self.matches.is_due(self.agent_steps):
             return {}
         actors = {name: learner.actor for name, learner in self.setup.learners.items()}
         env = replace(self.cfg.env, params=params_at(self.cfg.env.params, self.lessons.numbers))
-        return self.matches.play(env, self.agent_steps, self._layout(), actors)
+        return self.matches.play(env, self.agent_steps, self._layout(), actors, opponents)
 
     def score(self) -> float:
-        """Return what the best checkpoint is chosen by: return_mean; where there are two sides, the matches.
+        """Return what a best checkpoint is chosen by that no matches choose: return_mean.
 
-        There one side's gain is the other's loss, and the mean return says nothing. Nor does that of
-        demonstrations played back, of which the newest checkpoint has learnt most.
+        Of demonstrations played back it says nothing; there the newest checkpoint has learnt most.
         """
-        if self.cfg.bc.only:
-            return float(self.agent_steps)
-        if self.matches.two_sided:
-            return self.matches.score(self.agent_steps)
-        return self.recent_episodes.summary()["return_mean"]
+        return float(self.agent_steps) if self.cfg.bc.only else self.recent_episodes.summary()["return_mean"]
+
+    def is_best(self) -> bool:
+        """Return whether the policy is the best so far: by `score`; where there are two sides, by matches.
+
+        There one side's gain is the other's loss, and the mean return says nothing.
+        """
+        if self.matches.two_sided and not self.cfg.bc.only:
+            return self.matches.is_best(self.agent_steps)
+        return self.score() > self.best_score
 
     # --- checkpoints
 
@@ -195,10 +206,9 @@ class RunState:
         self._restore_lessons(state.get("lessons", {}), is_new=state["env"] is None)
 
         self.recent_episodes.load_state_dict(state["window"])
-        self.matches.load_state_dict(state["matches"])
+        self.matches.load_state_dict(state["matches"], state["best_score"])
         for name in _COUNTERS:
             setattr(self, name, state[name])
-        self.best_score = self.matches.comparable(self.best_score, state["matches"])
 
         # checkpoints of older versions hold no samples
         self.samples = state.get("samples", {})
