@@ -28,6 +28,13 @@ def test_two_players_by_hand() -> None:
     assert rate(points, 1)[1] == rate(points, 1)[1].__class__(ANCHOR, ANCHOR, ANCHOR)
 
 
+def test_intervals_of_some_players_are_those_of_all() -> None:
+    points = np.array([[0, 8, 12], [4, 0, 8], [3, 4, 0]])
+    every, some = rate(points, 0), rate(points, 0, intervals=[2])
+    assert some[2] == every[2] and [row.rating for row in some] == [row.rating for row in every]
+    assert math.isnan(some[1].low) and math.isnan(some[1].high)
+
+
 def test_three_players_whose_results_agree_with_one_another() -> None:
     # odds of 2 between neighbours, so of 4 between the ends
     points = np.array([[0, 8, 12], [4, 0, 8], [3, 4, 0]])

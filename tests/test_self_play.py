@@ -223,7 +223,7 @@ def test_elo_moves_as_in_ml_agents(tmp_path):
 
 @pytest.mark.parametrize("changes", [{}, {"team_change": 200, "opponents": OpponentDraw.hardest}])
 def test_a_run_with_a_pool_resumes_to_the_bit(tmp_path, changes):
-    cfg = matrix_game(8)
+    cfg = matrix_game(8, matches=MatchConfig(interval=128, count=4))
     cfg = replace(cfg, self_play=replace(cfg.self_play, fixed=["random"], **changes))
     whole = train(cfg, tmp_path / "whole")
     train(cfg, tmp_path / "parts", after_iteration=lambda s: "interrupted" if s.iteration == 4 else None)

@@ -672,20 +672,23 @@ class SelfPlayConfig:
 
 @dataclass
 class MatchConfig:
-    """Matches against a random side while training, for environments with two sides.
+    """Matches while training, against a random side and other opponents, for environments with two sides.
 
-    They choose best.pt: by the lower end of Wilson's 95 % interval for the share of the points that the
-    newest four series won together, draws counted half.
+    They choose best.pt: by the lower end of the 95 % interval of the policy's Bradley-Terry rating.
     """
 
     interval: Optional[int] = None
     """Agent decisions between two series of matches, with one more when max_steps are done; null: none."""
     count: int = 64
-    """Matches in a series, half of them on each side."""
+    """Matches in a series against each opponent, half of them on each side."""
+    opponents: int = 3
+    """Opponents at most that a series meets beside random, of those there are: the best policy, then those of
+    about the same rating."""
 
     def __post_init__(self) -> None:
         _at_least("matches.interval", self.interval, 1)
         _at_least("matches.count", self.count, 2)
+        _at_least("matches.opponents", self.opponents, 0)
 
 
 @dataclass

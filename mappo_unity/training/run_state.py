@@ -16,6 +16,8 @@ from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import sample_inputs
 from mappo_unity.policies.layouts import guessed_otherwise, without_channels
+from mappo_unity.policies.league.growing import step_name
+from mappo_unity.policies.policy import CheckpointPolicy, Policy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
 from mappo_unity.training.collection.batches import Batch, BatchCollector
@@ -46,13 +48,13 @@ class RunState:
 
     Attributes: `iteration`, how many are complete; `agent_steps`, agent decisions; `wall_s`, seconds spent
     collecting and learning; `saved_at`, agent decisions at the last regular checkpoint; `best_score`, of the
-    best checkpoint; `dropped_episodes` and `dropped_steps`, what crashed players cost; `samples`, inputs of
-    each policy that an export is compared on; `self_play`, the opponents, where there are some; `notes`,
-    lines for the user about what a checkpoint could not give back.
+    best checkpoint, which matches choose without it; `dropped_episodes` and `dropped_steps`, what crashed
+    players cost; `samples`, inputs of each policy that an export is compared on; `self_play`, the opponents,
+    where there are some; `notes`, lines for the user about what a checkpoint could not give back.
     """
 
     def __init__(self, cfg: Config, folder: Path, setup: TrainingSetup) -> None:
-        self.cfg, self.setup = cfg, setup
+        self.cfg, self.setup, self._folder = cfg, setup, folder
         self.iteration = self.agent_steps = self.saved_at = 0
         self.wall_s = 0.0
         self.best_score = -math.inf
@@ -132,6 +134,7 @@ class RunState:
             self.setup.forget_pending()
         self.recent_episodes.forget()
         self.best_score = -math.inf
+        self.matches.forget()
         return [f"{self.agent_steps:,} steps: {change}" for change in changes]
 
     def begin(self) -> None:
@@ -155,19 +158,35 @@ class RunState:
             return {}
         actors = {name: learner.actor for name, learner in self.setup.learners.items()}
         env = replace(self.cfg.env, params=params_at(self.cfg.env.params, self.lessons.numbers))
-        return self.matches.play(env, self.agent_steps, self._layout(), actors)
+        return self.matches.play(env, self.agent_steps, self._layout(), actors, self._rivals())
+
+    def _rivals(self) -> dict[str, Policy]:
+        """Return whom a policy may meet in a series beside random: opponents of self-play, the run's best."""
+        rivals = self.self_play.rivals(self._layout()) if self.self_play is not None else {}
+        best = self._folder / checkpoint.FOLDER / checkpoint.BEST
+        if best.exists():
+            with torch.random.fork_rng(
+                devices=[]
+            ):  # what training draws does not feel the network that is built
+                policy = CheckpointPolicy(best, deterministic=False)
+            rivals.setdefault(step_name(policy.agent_steps), policy)
+        return rivals
 
     def score(self) -> float:
-        """Return what the best checkpoint is chosen by: return_mean; where there are two sides, the matches.
+        """Return what a best checkpoint is chosen by that no matches choose: return_mean.
 
-        There one side's gain is the other's loss, and the mean return says nothing. Nor does that of
-        demonstrations played back, of which the newest checkpoint has learnt most.
+        Of demonstrations played back it says nothing; there the newest checkpoint has learnt most.
         """
-        if self.cfg.bc.only:
-            return float(self.agent_steps)
-        if self.matches.two_sided:
-            return self.matches.score(self.agent_steps)
-        return self.recent_episodes.summary()["return_mean"]
+        return float(self.agent_steps) if self.cfg.bc.only else self.recent_episodes.summary()["return_mean"]
+
+    def is_best(self) -> bool:
+        """Return whether the policy is the best so far: by `score`; where there are two sides, by matches.
+
+        There one side's gain is the other's loss, and the mean return says nothing.
+        """
+        if self.matches.two_sided and not self.cfg.bc.only:
+            return self.matches.is_best(self.agent_steps)
+        return self.score() > self.best_score
 
     # --- checkpoints
 
@@ -212,13 +231,12 @@ class RunState:
         self._restore_lessons(state.get("lessons", {}), is_new=state["env"] is None)
 
         self.recent_episodes.load_state_dict(state["window"])
-        self.matches.load_state_dict(state["matches"])
+        self.matches.load_state_dict(state["matches"], state["best_score"])
         # a run may take up self-play, or leave it, when it is resumed
         if self.self_play is not None and state.get("self_play") is not None:
             self.self_play.load_state_dict(state["self_play"], self.notes.append)
         for name in _COUNTERS:
             setattr(self, name, state[name])
-        self.best_score = self.matches.comparable(self.best_score, state["matches"])
 
         # checkpoints of older versions hold no samples
         self.samples = state.get("samples", {})

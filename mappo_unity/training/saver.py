@@ -53,18 +53,15 @@ class CheckpointSaver:
         """Save after the first iteration, at the regular interval, or where these weights won a series.
 
         Args:
-            won: the iteration's series of matches is at least as good as the best one before.
+            won: the iteration's series of matches made these weights the best.
         """
         state = self._state
         is_over = state.agent_steps - state.saved_at >= self._cfg.checkpoint_interval
         if won or is_over or self.last is None:
-            self.save(won)
+            self.save()
 
-    def save(self, best: bool = False) -> None:
+    def save(self) -> None:
         """Write a checkpoint of the last complete iteration, unless there is one.
-
-        Args:
-            best: call it the best one though its score is only as good as the best before.
 
         Raises:
             CheckpointError: it cannot be written.
@@ -73,10 +70,9 @@ class CheckpointSaver:
         if complete is None or complete["iteration"] == self._saved_iteration:
             return
 
-        score = state.score()
-        best = best or score > state.best_score
+        best = state.is_best()
         if best:
-            state.best_score = score
+            state.best_score = state.score()
         if self.last is not None:  # the first one comes early and is not part of the rhythm
             state.saved_at = complete["agent_steps"]
         # both are known only now, and a resumed run needs them

@@ -132,7 +132,7 @@ def _iterate(
             log.message(state.matches.said)
 
         # The best weights are those that won the series, not those of a later checkpoint.
-        saver.save_if_due(won=bool(series) and state.score() >= state.best_score)
+        saver.save_if_due(won=bool(series) and state.is_best())
         status = (after_iteration(state) if after_iteration else None) or _status(cfg, state, stop)
 
     # the loop is over: the timer of a first signal must not break off the last checkpoint

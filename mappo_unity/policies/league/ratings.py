@@ -14,6 +14,7 @@ narrow.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +39,12 @@ class Rating:
     high: float
 
 
-def rate(points: np.ndarray, anchor: int | None = None, prior: float | None = PRIOR) -> list[Rating]:
+def rate(
+    points: np.ndarray,
+    anchor: int | None = None,
+    prior: float | None = PRIOR,
+    intervals: Collection[int] | None = None,
+) -> list[Rating]:
     """Return the players' ratings.
 
     Args:
@@ -46,6 +52,8 @@ def rate(points: np.ndarray, anchor: int | None = None, prior: float | None = PR
             matches of the two are ``points[i, j] + points[j, i]``.
         anchor: the player who is rated `ANCHOR` by definition; None: the mean of all is.
         prior: standard deviation in points; None: no prior, where nobody won or lost everything.
+        intervals: the players whose intervals are wanted, which take most of the time; None: all. The ends
+            of the others' are NaN.
     """
     count = len(points)
     league = _League(np.asarray(points, float), 0.0 if prior is None else (ELO / prior) ** 2)
@@ -57,7 +65,10 @@ def rate(points: np.ndarray, anchor: int | None = None, prior: float | None = PR
         contrast = np.eye(count)[player]
         contrast = contrast - (np.full(count, 1 / count) if anchor is None else np.eye(count)[anchor])
         middle = float(contrast @ best)
-        ends = [_end(league, contrast, best, sign) if contrast.any() else middle for sign in (-1, 1)]
+        if intervals is not None and player not in intervals:
+            ends = [math.nan, math.nan]
+        else:
+            ends = [_end(league, contrast, best, sign) if contrast.any() else middle for sign in (-1, 1)]
         ratings.append(Rating(*(ANCHOR + ELO * value for value in (middle, *ends))))
 
     return ratings

@@ -19,12 +19,16 @@ from mappo_unity import keys
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.opponents import Draws, Opponents
+from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.policies.layouts import sides_of
+from mappo_unity.policies.league.growing import step_name
 from mappo_unity.policies.league.ratings import expected
+from mappo_unity.policies.policy import ActorPolicy, Policy
+from mappo_unity.policies.policy_files import RANDOM
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.episode_stats import by_policy
 from mappo_unity.training.self_play.draw import LATEST, draw_teams
-from mappo_unity.training.self_play.fixed import load_fixed
+from mappo_unity.training.self_play.fixed import OPTION, load_fixed
 from mappo_unity.training.self_play.pool import Pool, Record
 from mappo_unity.training.setup import TrainingSetup
 
@@ -100,6 +104,20 @@ class SelfPlay:
             self._drawn_at = agent_steps
             self._draw()
         return metrics, changed
+
+    def rivals(self, layout: dict[str, Any]) -> dict[str, Policy]:
+        """Return the opponents of the pool as policies that play matches, the fixed ones first.
+
+        Args:
+            layout: what the policies were built for, by policy name.
+        """
+        named = [where for where in self._cfg.fixed if where != RANDOM]
+        rivals = {where: open_policy(where, False, self._seed, OPTION) for where in named}
+        for number in self._pool.numbers:
+            name = step_name(self._pool.steps(number))
+            actors = {policy: self._make_actor(policy, number) for policy in self._setup.learners}
+            rivals[name] = ActorPolicy(layout, actors, False, name)
+        return rivals
 
     # --- results
 
