@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from typing import Any
 
@@ -62,7 +62,7 @@ def _check_teachers(given: list[str], configs: list[Config]) -> None:
         for key in given:
             if key.startswith("rewards.") and _is_changed(key, configs):
                 raise ConfigError(
-                    f"{key}={show_value(_value(key, configs[0]))} has no effect with bc.only=true, which "
+                    f"{_shown(key, configs[0])} has no effect with bc.only=true, which "
                     "learns from the demonstrations alone; leave one of the two out"
                 )
 
@@ -73,7 +73,7 @@ def _check_teachers(given: list[str], configs: list[Config]) -> None:
         for key in given:
             if key.startswith(f"{section}.") and _is_changed(key, configs):
                 raise ConfigError(
-                    f"{key}={show_value(_value(key, configs[0]))} has no effect without "
+                    f"{_shown(key, configs[0])} has no effect without "
                     f"{section}.{switch}: give {section}.{switch}={example}, or leave it out"
                 )
 
@@ -103,3 +103,8 @@ def _is_changed(key: str, configs: list[Config]) -> bool:
 
 def _value(key: str, config: Config) -> Any:
     return attrgetter(key)(config)
+
+
+def _shown(key: str, config: Config) -> str:
+    value = _value(key, config)
+    return key if is_dataclass(value) else f"{key}={show_value(value)}"

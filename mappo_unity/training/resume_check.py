@@ -67,11 +67,11 @@ def check_streams(path: Path, saved: dict[str, Any], learners: dict[str, PolicyL
         for own in learner.rewards.intrinsic:
             model = saved[name]["rewards"][own.name]["model"]
             if _shapes(model) != _shapes(own.model.state_dict()):
-                here = {option: value for option, value in vars(own.cfg).items() if option in _OF_LAYERS}
+                options = {option: value for option, value in vars(own.cfg).items() if option in _OF_LAYERS}
                 raise CheckpointError(
                     f"checkpoint {path} holds another model of rewards.{own.name} of {name}: what makes its "
                     "layers cannot change with resume; here "
-                    + ", ".join(f"{option}={show_value(value)}" for option, value in here.items())
+                    + ", ".join(f"{option}={show_value(value)}" for option, value in options.items())
                 )
 
 
