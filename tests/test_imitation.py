@@ -9,6 +9,7 @@ import pytest
 import torch
 from mlagents_envs.base_env import ActionSpec, BehaviorSpec
 
+from mappo_unity import load_policy
 from mappo_unity.cli import eval_main, play_main, train_main
 from mappo_unity.config.schema import BCConfig, GAILConfig, MemoryKind, ModelConfig, PPOConfig
 from mappo_unity.learning.imitation.cloning import Cloning, _cut
@@ -18,9 +19,11 @@ from mappo_unity.learning.networks.distributions import ActionDistribution, Acti
 from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.rewards.gail import Discriminator
 from mappo_unity.learning.rewards.streams import IntrinsicStream
+from mappo_unity.protocol.demos import reader
 from mappo_unity.protocol.demos.demonstration import Demonstration
 from mappo_unity.protocol.demos.replay_env import ReplayEnv
 from mappo_unity.runs import checkpoint
+from mappo_unity.scenes import make_scene
 
 
 def vector_sensor(size: int):
@@ -227,16 +230,16 @@ TINY += ["collect.batch_size=200", "ppo.lr_schedule=constant", "ppo.entropy_sche
 
 @pytest.mark.parametrize(
     "teachers",
-    [["bc.only=true"], ["bc.strength=0.5", "bc.steps=700"], ["gail"]],
-    ids=["only", "beside", "gail"],
+    [["bc.only=true"], ["bc.strength=0.5", "bc.steps=700"], ["gail"], ["gail", "model.memory=lstm"]],
+    ids=["only", "beside", "gail", "gail and memory"],
 )
 def test_runs_with_demonstrations_resume_to_the_bit(
     teachers: list[str], demo_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     demos = f"demos=[{demo_file}]"
-    if teachers == ["gail"]:
-        line = [*TINY, "rewards.gail.strength=0.5", f"rewards.gail.{demos}"]
+    if teachers[0] == "gail":
+        line = [*TINY, *teachers[1:], "rewards.gail.strength=0.5", f"rewards.gail.{demos}"]
     else:
         line = [*TINY, *teachers, f"bc.{demos}"]
 
@@ -248,6 +251,32 @@ def test_runs_with_demonstrations_resume_to_the_bit(
     assert all(torch.equal(one["actor"][name], two["actor"][name]) for name in one["actor"])
 
     assert eval_main(["run=whole", "episodes=1"]) == 0
+
+
+def test_both_sides_are_cloned_and_play_matches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert play_main(["env=SoccerTwos", "record=two.demo", "seconds=3"]) == 0
+    line = ["env=SoccerTwos", *TINY[1:], "bc.only=true", "bc.demos=[two.demo]", "env.num_areas=2"]
+    line += ["export_onnx=false", "matches.count=2", "hydra.run.dir=run"]  # the preset asks for matches
+
+    # the recording is of one file, and read once for both sides and for the cloning
+    read: list[Path] = []
+    monkeypatch.setattr(reader, "_read", lambda path, plain=reader._read: read.append(path) or plain(path))
+    assert train_main([*line, "max_steps=200"]) == 0
+    assert read == [Path("two.demo")]
+    assert "of 2 matches against a random side" in capsys.readouterr().out
+
+    # members of a team, though each was cloned by itself
+    state = checkpoint.load(Path("run/checkpoints/best.pt"))
+    assert state["layout"]["SoccerTwos"]["team_size"] == 1 and len(state["env"]["behaviors"]) == 2
+    policy = load_policy("run")
+    scene = make_scene("SoccerTwos", seed=0, num_areas=1)
+    scene.reset()
+    for name, spec in scene.behavior_specs.items():
+        steps = scene.get_steps(name)[0]
+        assert len(steps) == 2 and policy.act(name, steps, spec).discrete.shape == (2, 3)
 
 
 @pytest.mark.parametrize(

@@ -303,7 +303,7 @@ def test_a_run_with_streams_is_resumed_to_the_bit(
         ("rewards.extrinsic.gamma=2", "rewards.extrinsic.gamma must be from 0 to 1"),
         ("rewards.curiosity=0.02", "rewards.curiosity is a section"),
         ("rewards.curious.strength=1", "rewards.curiosity.strength"),
-        ("behaviors.3DBall.rewards.rnd.size=1", "'size' not in 'RNDConfig'"),
+        ("behaviors.3DBall.rewards.rnd.size=1", "behaviors.3DBall.rewards.rnd.size is not an option"),
     ],
 )
 def test_mistakes_are_explained(

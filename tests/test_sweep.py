@@ -192,6 +192,14 @@ def test_a_search_that_cannot_be_run_is_refused(line: str, words: list[str]) -> 
         assert word in str(caught.value)
 
 
+def test_a_search_turns_a_stream_on_whose_options_are_given() -> None:
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    lines = ["hydra/sweeper=optuna", "rewards.rnd.lr=1e-3"]
+    assert len(plan_jobs([*lines, "rewards.rnd.strength=interval(0.1,1)"]).jobs) == 1
+    with pytest.raises(ConfigError, match="rewards.rnd.lr=0.001 has no effect without rewards.rnd.strength"):
+        plan_jobs([*lines, "ppo.lr=interval(0.001,0.01)"])
+
+
 def test_no_processes_are_refused() -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     with pytest.raises(ConfigError, match="hydra.launcher.n_jobs=0 is out of range"):

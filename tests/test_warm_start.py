@@ -428,7 +428,7 @@ def strange_model(path: Path, op: str) -> None:
             ["init_from=own.onnx", "behaviors.Probe.model.hidden=[7]"],
             "behaviors.Probe.model.hidden=[7] contra",
         ),
-        (["init_from=other.onnx"], "nothing of it fits the networks of Probe"),
+        (["init_from=other.onnx"], "no layer of it fits the actor of Probe"),
         (["behaviors.Probe.init_from=5"], "behaviors.Probe.init_from=5 must name"),
         (["behaviors.Probe.train=maybe"], "behaviors.Probe.train='maybe' must be true or false"),
         (["behaviors.Probe.train=false"], "nothing is learnt, since every behavior"),

@@ -17,7 +17,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from mappo_unity.config import backend_options
+from mappo_unity.config import effects
 from mappo_unity.config.behavior_lines import OPEN
 from mappo_unity.config.option_table import option_table
 from mappo_unity.config.options_file import file_root
@@ -173,7 +173,7 @@ def compose_plain(lines: list[str], schema: type) -> Any:
 
 def check_effect(lines: list[str], configs: list[Config]) -> None:
     """Refuse options on the command line that none of the runs it stands for looks at; raise ConfigError."""
-    backend_options.check_effect(given_options(lines), configs)
+    effects.check_effect(given_options(lines), configs)
 
 
 def _keep_parameters_whole(tree: DictConfig, lines: list[str]) -> None:

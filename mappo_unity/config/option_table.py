@@ -189,10 +189,13 @@ def _class_docs(node: ast.ClassDef) -> dict[str, str]:
 
         # a field's docstring is the text right below it
         if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
-            docs[item.target.id] = inspect.cleandoc(str(following.value.value))
+            docs[item.target.id] = " ".join(str(following.value.value).split())
 
     return docs
 
 
 def _field_docs(schema: type) -> dict[str, str]:
-    return _module_docs(schema.__module__).get(schema.__name__, {})
+    docs: dict[str, str] = {}
+    for base in reversed(schema.__mro__[:-1]):  # all but object
+        docs |= _module_docs(base.__module__).get(base.__name__, {})
+    return docs

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mappo_unity.config.option_table import show_value
+from mappo_unity.config.overrides import check_value
 from mappo_unity.config.schema import BCConfig, Config, ModelConfig, PPOConfig, RewardsConfig
 from mappo_unity.errors import ConfigError
 
@@ -52,7 +54,16 @@ def behavior_config(cfg: Config, policy: str) -> BehaviorConfig:
     """
     own = cfg.behaviors.get(policy) or {}
     where = f"behaviors.{policy}"
+    _check_form(own, where)
 
+    sections = BehaviorConfig._fields
+    out = BehaviorConfig(*(_merged(getattr(cfg, s), own.get(s), f"{where}.{s}") for s in sections))
+    if not is_frozen(cfg, policy):
+        _check_teachers(out, policy)
+    return out
+
+
+def _check_form(own: Any, where: str) -> None:
     # the schema has no fields below a behavior's name, so nothing has checked their form yet
     if not isinstance(own, dict):
         raise ConfigError(f"{where}={own!r} must hold sections, for example {where}.ppo.lr=1e-4")
@@ -72,7 +83,24 @@ def behavior_config(cfg: Config, policy: str) -> BehaviorConfig:
     if not isinstance(own.get(TRAIN, True), bool):
         raise ConfigError(f"{where}.{TRAIN}={own[TRAIN]!r} must be true or false")
 
-    return BehaviorConfig(*(_merged(getattr(cfg, s), own.get(s), f"{where}.{s}") for s in sections))
+    if isinstance(own.get("bc"), dict) and "only" in own["bc"]:
+        raise ConfigError(
+            f"{where}.bc.only={show_value(own['bc']['only'])} has no effect: the environment is played for "
+            "all behaviors or for none; give bc.only=true"
+        )
+
+
+def _check_teachers(out: BehaviorConfig, policy: str) -> None:
+    if not (out.rewards.extrinsic.strength or out.rewards.intrinsic or out.bc.demos):
+        raise ConfigError(
+            f"rewards.extrinsic.strength=0 leaves {policy} nothing to learn from: turn another stream on, "
+            "such as rewards.rnd.strength=0.3"
+        )
+    if out.bc.demos and not out.model.share_parameters:
+        raise ConfigError(
+            f"bc.demos={show_value(out.bc.demos)} of {policy} needs model.share_parameters=true: a recording "
+            "does not tell the members of a team apart"
+        )
 
 
 def init_source(cfg: Config, policy: str) -> tuple[str, str | None]:
@@ -109,4 +137,15 @@ def _merged(section: Any, own: Any, where: str) -> Any:
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     except OmegaConfBaseException as error:
+        _explain(own, where)
         raise ConfigError(f"{where}: {str(error).splitlines()[0]}") from error
+
+
+def _explain(own: dict[Any, Any], where: str) -> None:
+    """Raise ConfigError for the first value that does not fit its option, as for options of all."""
+    behavior, _, section = where.rpartition(".")
+    for name, value in own.items():
+        try:
+            check_value(f"{section}.{name}", value, Config)
+        except ConfigError as error:
+            raise ConfigError(f"{behavior}.{error}") from error

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Optional
 
-from mappo_unity.config.parameters.values import FACTORY, PLAYERS, SCENE, read_parameters
+from mappo_unity.config.parameters.values import FACTORY, PLAYERS, SCENE, curricula, read_parameters
 from mappo_unity.errors import ConfigError
 
 
@@ -491,66 +491,59 @@ class ExtrinsicConfig:
 
 
 @dataclass
-class CuriosityConfig:
+class IntrinsicConfig:
+    """A stream of rewards that a model of its own gives."""
+
+    strength: float = 0.0
+    """Factor of the reward; 0: this stream is off."""
+    gamma: float = 0.99
+    """Discount of the reward."""
+    lr: float = 3e-4
+    """Learning rate of the stream's model."""
+    hidden: list[int] = field(default_factory=lambda: [128, 128])
+    """Widths of the model's layers."""
+    normalize: bool = True
+    """Divide the reward by the running deviation of its discounted sums; false: as it is (ML-Agents)."""
+
+    _section = ""
+
+    def __post_init__(self) -> None:
+        _at_least(f"{self._section}.strength", self.strength, 0)
+        _within(f"{self._section}.gamma", self.gamma, 0, 1)
+        _above(f"{self._section}.lr", self.lr, 0)
+        _check_widths(f"{self._section}.hidden", self.hidden)
+
+
+@dataclass
+class CuriosityConfig(IntrinsicConfig):
     """Reward for what a model of the environment does not foresee (ICM, arXiv 1705.05363)."""
 
-    strength: float = 0.0
-    """Factor of the reward; 0: this stream is off."""
-    gamma: float = 0.99
-    """Discount of the reward."""
-    lr: float = 3e-4
-    """Learning rate of the model."""
-    hidden: list[int] = field(default_factory=lambda: [128, 128])
-    """Widths of the layers that turn observations into features."""
-    normalize: bool = True
-    """Divide the reward by the running deviation of its discounted sums; false: as it is (ML-Agents)."""
-
-    def __post_init__(self) -> None:
-        _check_intrinsic("rewards.curiosity", self)
+    _section = "rewards.curiosity"
 
 
 @dataclass
-class RNDConfig:
+class RNDConfig(IntrinsicConfig):
     """Reward for observations that are new (random network distillation, arXiv 1810.12894)."""
 
-    strength: float = 0.0
-    """Factor of the reward; 0: this stream is off."""
-    gamma: float = 0.99
-    """Discount of the reward."""
     lr: float = 1e-4
-    """Learning rate of the predictor."""
-    hidden: list[int] = field(default_factory=lambda: [128, 128])
-    """Widths of the layers of predictor and target."""
-    normalize: bool = True
-    """Divide the reward by the running deviation of its discounted sums; false: as it is (ML-Agents)."""
-
-    def __post_init__(self) -> None:
-        _check_intrinsic("rewards.rnd", self)
+    _section = "rewards.rnd"
 
 
 @dataclass
-class GAILConfig:
+class GAILConfig(IntrinsicConfig):
     """Reward for what a discriminator takes for the demonstrations' (GAIL, arXiv 1606.03476)."""
 
-    strength: float = 0.0
-    """Factor of the reward; 0: this stream is off."""
-    gamma: float = 0.99
-    """Discount of the reward."""
-    lr: float = 3e-4
-    """Learning rate of the discriminator."""
-    hidden: list[int] = field(default_factory=lambda: [128, 128])
-    """Widths of the discriminator's layers."""
+    normalize: bool = False
     demos: list[str] = field(default_factory=list)
     """Unity's .demo files, or folders of them."""
     use_actions: bool = False
     """Judge observations with actions and ends; false: observations alone."""
     use_vail: bool = False
     """Let the discriminator see features through a bottleneck (VAIL, arXiv 1810.00821)."""
-    normalize: bool = False
-    """Divide the reward by the running deviation of its discounted sums."""
+    _section = "rewards.gail"
 
     def __post_init__(self) -> None:
-        _check_intrinsic("rewards.gail", self)
+        super().__post_init__()
         if self.strength > 0 and not self.demos:
             raise ConfigError(
                 f"rewards.gail.strength={self.strength:g} needs demonstrations: "
@@ -575,8 +568,6 @@ class BCConfig:
     def __post_init__(self) -> None:
         _above("bc.strength", self.strength, 0)
         _at_least("bc.steps", self.steps, 0)
-        if self.only and not self.demos:
-            raise ConfigError("bc.only=true needs demonstrations: bc.demos=[expert.demo]")
         if self.only and self.steps:
             raise ConfigError(f"bc.steps={self.steps} does not go with bc.only=true: nothing would be left")
 
@@ -595,9 +586,13 @@ class RewardsConfig:
     """Reward for what a discriminator takes for the demonstrations'."""
 
     @property
-    def intrinsic(self) -> dict[str, Any]:
+    def intrinsic(self) -> dict[str, IntrinsicConfig]:
         """The streams beside the environment's that are on, by name."""
-        streams: dict[str, Any] = {"curiosity": self.curiosity, "rnd": self.rnd, "gail": self.gail}
+        streams: dict[str, IntrinsicConfig] = {
+            "curiosity": self.curiosity,
+            "rnd": self.rnd,
+            "gail": self.gail,
+        }
         return {name: stream for name, stream in streams.items() if stream.strength > 0}
 
 
@@ -772,6 +767,25 @@ class Config:
 
         if not re.fullmatch(r"cpu|cuda(:[0-9]+)?", self.device):
             raise ConfigError(f"device={self.device!r} must be one of cpu, cuda, cuda:N")
+        if self.bc.only:
+            self._check_cloning()
+
+    def _check_cloning(self) -> None:
+        own = [section.get("bc") for section in self.behaviors.values() if isinstance(section, dict)]
+        if not self.bc.demos and not any(bc.get("demos") for bc in own if isinstance(bc, dict)):
+            raise ConfigError("bc.only=true needs demonstrations: bc.demos=[expert.demo]")
+
+        lessons = curricula(self.env.parameters)
+        if lessons:
+            raise ConfigError(
+                f"env.params.{next(iter(lessons))} has lessons, which do not go with bc.only=true: the "
+                "environment is not played; give a number, or leave it out"
+            )
+        if self.stop_at_return is not None:
+            raise ConfigError(
+                f"stop_at_return={self.stop_at_return:g} does not go with bc.only=true, where the return is "
+                "the recording's; max_steps ends the run"
+            )
 
 
 @dataclass
@@ -894,13 +908,6 @@ def _not_empty(**options: Optional[str]) -> None:
     for name, value in options.items():
         if value == "":
             raise ConfigError(f"{name}= is empty: give it a value, or leave it out")
-
-
-def _check_intrinsic(section: str, cfg: CuriosityConfig | RNDConfig | GAILConfig) -> None:
-    _at_least(f"{section}.strength", cfg.strength, 0)
-    _within(f"{section}.gamma", cfg.gamma, 0, 1)
-    _above(f"{section}.lr", cfg.lr, 0)
-    _check_widths(f"{section}.hidden", cfg.hidden)
 
 
 def _check_widths(option: str, widths: list[int]) -> None:

@@ -25,15 +25,24 @@ def make_replay_function(cfg: Config) -> MakeEnv:
     """
     specs = _specs(cfg)
     if specs is None:
+        if not cfg.bc.demos:
+            raise ConfigError(
+                f"bc.only=true with env.backend={cfg.env.backend.value} needs bc.demos=[expert.demo]: the "
+                "recording says what the behavior is"
+            )
         demo = read_demos(cfg.bc.demos)
         return lambda seed: ReplayEnv({demo.behavior: demo})
 
     demos: dict[str, Demonstration] = {}
     for behavior, spec in specs.items():
+        # both sides of a policy learn from the same recording, and have the same options
         name = keys.policy_name(behavior)
-        # both sides of a policy learn from the same recording
-        if name not in map(keys.policy_name, demos):
-            demos[behavior] = read_fitting(behavior_config(cfg, name).bc.demos, spec, name)
+        paths = behavior_config(cfg, name).bc.demos
+        if not paths:
+            raise ConfigError(
+                f"bc.only=true, but {name} has no demonstrations: behaviors.{name}.bc.demos=[expert.demo]"
+            )
+        demos[behavior] = read_fitting(paths, spec, name)
     return lambda seed: ReplayEnv(demos)
 
 

@@ -22,11 +22,18 @@ class Places(NamedTuple):
     shape: tuple[int, int]  # G, A
 
 
-def team_places(group_id: np.ndarray, team_size: int) -> Places:
+def team_places(group_id: np.ndarray, team_size: int | None = None) -> Places:
     """Give each row its team and its place in it: the order of the rows of a group.
 
     Members that are not asked at the same time are not told apart by this, which matters to policies with a
     network for each member alone (`MemberTable`).
+
+    Args:
+        group_id: int ``[n]``, 0 = alone.
+        team_size: places of a team; None: as many as the largest one needs.
+
+    Raises:
+        ConfigError: a team is larger.
     """
     # Group 0 is none: each of its agents is a team of its own, numbered after the groups.
     alone = np.arange(len(group_id)) + int(group_id.max(initial=0)) + 1
@@ -39,12 +46,11 @@ def team_places(group_id: np.ndarray, team_size: int) -> Places:
     members = np.empty(len(teams), np.int64)
     members[order] = np.arange(len(teams)) - np.repeat(starts, np.diff(np.r_[starts, len(teams)]))
 
-    if members.max(initial=0) >= team_size:
-        raise ConfigError(
-            f"a team of {members.max() + 1} agents is larger than the policy's {team_size} members"
-        )
+    largest = int(members.max(initial=0)) + 1
+    if team_size is not None and largest > team_size:
+        raise ConfigError(f"a team of {largest} agents is larger than the policy's {team_size} members")
 
-    return Places(teams, members, (int(teams.max(initial=-1)) + 1, team_size))
+    return Places(teams, members, (int(teams.max(initial=-1)) + 1, team_size or largest))
 
 
 class MemberTable:

@@ -148,9 +148,10 @@ class ActorPolicy:
 
     def _places(self, behavior: str, steps: DecisionSteps) -> Places:
         name = keys.policy_name(behavior)
-        team_size = self.layout[name]["team_size"]
         if name not in self._per_member:
-            return team_places(steps.group_id, team_size)
+            # one network for all members plays in teams of any size
+            return team_places(steps.group_id)
+        team_size = self.layout[name]["team_size"]
         table = self._members.setdefault(behavior, MemberTable(team_size))
         return table.places(steps.agent_id, steps.group_id)
 

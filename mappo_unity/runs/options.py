@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mappo_unity.config.compose import check_effect, compose_config, load_config
+from mappo_unity.config.option_table import show_value
 from mappo_unity.config.overrides import last_value, parse
 from mappo_unity.config.presets import group_choices
 from mappo_unity.config.schema import Config
@@ -46,6 +47,13 @@ def compose_resumed(lines: list[str], base: Path) -> Config:
         raise ConfigError(
             f"seed={config.seed} cannot change with resume: the run has seed={saved.seed}, and its random "
             "numbers go on where they were; leave seed out, or start a new run without resume"
+        )
+
+    if config.bc.only != saved.bc.only:
+        raise ConfigError(
+            f"bc.only={show_value(config.bc.only)} cannot change with resume: the run has "
+            f"bc.only={show_value(saved.bc.only)}; a new run can begin with its networks, "
+            f"init_from={base.parent}"
         )
 
     check_effect(rest, [config])

@@ -48,7 +48,7 @@ def make_learners(
 
     learners = {}
     for name, sides in env.sides.items():
-        model, ppo, *_ = behavior_config(cfg, name)
+        model, ppo, rewards, _ = behavior_config(cfg, name)
         behavior = env.behaviors[sides[0]]
         # sides that share a policy are stacked: all their teams are rows of its batch
         teams, team_size = behavior.slots.num_teams * len(sides), behavior.slots.team_size
@@ -61,7 +61,7 @@ def make_learners(
         note_unmarked(name, sensors, note)
         check_sides(name, sensors, model.image_encoder)
         layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
-        check_network_memory(name, obs, layout, team_size, model)
+        check_network_memory(name, obs, layout, team_size, model, rewards)
 
         # Built after the check, so that what does not fit is refused by a line of ours.
         learners[name] = _make_learner(cfg, name, obs, layout, team_size, behavior.spec)

@@ -6,13 +6,15 @@ import os
 from pathlib import Path
 
 import torch
+from torch import nn
 
-from mappo_unity.config.schema import Config, ModelConfig
+from mappo_unity.config.schema import Config, ModelConfig, RewardsConfig
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.actor_critic import make_actor, make_critic
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
+from mappo_unity.learning.rewards.streams import make_models
 
 BATCH_COPIES = 4
 """Memory of a batch in units of its observations: as collected, behind the rounds that are carried, the rows
@@ -60,19 +62,38 @@ def check_batch_memory(cfg: Config, env: UnityEnv, rounds: int) -> None:
 
 
 def check_network_memory(
-    name: str, obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig
+    name: str,
+    obs: ObsLayout,
+    layout: ActionLayout,
+    team_size: int,
+    cfg: ModelConfig,
+    rewards: RewardsConfig,
 ) -> None:
     """Raise ConfigError if a policy's networks do not fit into the memory that is free."""
     with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers
         nets = make_actor(obs, layout, team_size, cfg), make_critic(obs, team_size, cfg, layout)
+        streams = make_models(obs, layout, rewards)
 
-    size = sum(p.numel() * p.element_size() for net in nets for p in net.parameters())
+    for stream, model in streams.items():
+        size, hidden = _weights(model), list(rewards.intrinsic[stream].hidden)
+        check_free(
+            WEIGHT_COPIES * size,
+            f"rewards.{stream}.hidden={hidden}: learning its model for {name} ({show_size(size)})",
+            f"lower rewards.{stream}.hidden",
+        )
+
+    size = sum(map(_weights, nets))
     check_free(
         WEIGHT_COPIES * size,
         f"model.hidden={list(cfg.hidden)}, critic {list(cfg.critic_hidden or cfg.hidden)}: learning the "
         f"networks of {name} ({show_size(size)})",
         "lower model.hidden or model.critic_hidden",
     )
+
+
+def _weights(net: nn.Module) -> int:
+    """Return the bytes of a network's weights."""
+    return sum(p.numel() * p.element_size() for p in net.parameters())
 
 
 def show_size(size: float) -> str:

@@ -71,7 +71,9 @@ def plan_jobs(
 
     # Whether an option has an effect depends on the backend, which such a search has not chosen yet.
     if not is_search(lines) or not _sweeps_backend(task):
-        check_effect(list(dict.fromkeys(line for job in jobs for line in job)), configs)
+        # what a search chooses stands in no job
+        given = task if is_search(lines) else dict.fromkeys(line for job in jobs for line in job)
+        check_effect(list(given), configs)
 
     return Plan(jobs, configs, first)
 

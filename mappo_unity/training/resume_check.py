@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from mappo_unity.config.option_table import show_value
 from mappo_unity.config.schema import ModelConfig, bounded_log_std
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.learning.ppo import PolicyLearner
@@ -52,7 +53,7 @@ def check_compatible(
 
 
 def check_streams(path: Path, saved: dict[str, Any], learners: dict[str, PolicyLearner]) -> None:
-    """Refuse a checkpoint whose critics have values for other reward streams, saying which."""
+    """Refuse a checkpoint that has other reward streams, or a stream with another model, saying which."""
     for name, learner in learners.items():
         there = set(saved[name].get("rewards", {}))
         here = {stream.name for stream in learner.rewards.intrinsic}
@@ -62,6 +63,24 @@ def check_streams(path: Path, saved: dict[str, Any], learners: dict[str, PolicyL
                 f"checkpoint {path} holds another critic of {name}: rewards.{stream} is {state} there and "
                 f"{other} here; its strength may change with resume, but not from or to 0"
             )
+
+        for own in learner.rewards.intrinsic:
+            model = saved[name]["rewards"][own.name]["model"]
+            if _shapes(model) != _shapes(own.model.state_dict()):
+                options = {option: value for option, value in vars(own.cfg).items() if option in _OF_LAYERS}
+                raise CheckpointError(
+                    f"checkpoint {path} holds another model of rewards.{own.name} of {name}: what makes its "
+                    "layers cannot change with resume; here "
+                    + ", ".join(f"{option}={show_value(value)}" for option, value in options.items())
+                )
+
+
+_OF_LAYERS = ("hidden", "use_actions", "use_vail")
+"""Options of streams that their models' layers follow from."""
+
+
+def _shapes(state: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(value.shape) for name, value in state.items()}
 
 
 def plain(value: Any) -> Any:

@@ -31,12 +31,12 @@ class Discriminator(nn.Module):
         obs: the observation entries of an agent.
         layout: the sizes of its action.
         cfg: the stream's options.
-        expert: the demonstrations.
+        expert: the demonstrations; None: it has only a shape.
     """
 
     beta: Tensor
 
-    def __init__(self, obs: ObsLayout, layout: ActionLayout, cfg: GAILConfig, expert: Expert) -> None:
+    def __init__(self, obs: ObsLayout, layout: ActionLayout, cfg: GAILConfig, expert: Expert | None) -> None:
         super().__init__()
         self.layout, self.cfg, self.expert = layout, cfg, expert
         self.encoder = Encoder(obs, normalize=True)
@@ -60,6 +60,7 @@ class Discriminator(nn.Module):
 
     def loss(self, decisions: Transitions) -> Tensor:
         """Return the discriminator's loss beside as many of the expert's decisions, a scalar."""
+        assert self.expert is not None
         device = decisions.at.device
         drawn = torch.randint(len(self.expert), (len(decisions),)).to(device)
         theirs, ours = self._features(self.expert.steps[drawn]), self._features(decisions)

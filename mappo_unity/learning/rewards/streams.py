@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from mappo_unity import keys
-from mappo_unity.config.schema import CuriosityConfig, GAILConfig, PPOConfig, RewardsConfig, RNDConfig
+from mappo_unity.config.schema import IntrinsicConfig, PPOConfig, RewardsConfig
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.distributions import ActionLayout
@@ -37,7 +37,7 @@ class IntrinsicStream:
         cfg: the stream's options.
     """
 
-    def __init__(self, name: str, model: nn.Module, cfg: CuriosityConfig | RNDConfig | GAILConfig) -> None:
+    def __init__(self, name: str, model: nn.Module, cfg: IntrinsicConfig) -> None:
         self.name, self.cfg = name, cfg
         self.model: Any = model
         learns = [parameter for parameter in model.parameters() if parameter.requires_grad]
@@ -186,12 +186,19 @@ def make_intrinsic(
         device: of the networks.
         expert: the demonstrations, where GAIL is on.
     """
+    models = make_models(obs, layout, cfg, expert)
+    return [IntrinsicStream(name, model.to(device), cfg.intrinsic[name]) for name, model in models.items()]
+
+
+def make_models(
+    obs: ObsLayout, layout: ActionLayout, cfg: RewardsConfig, expert: Expert | None = None
+) -> dict[str, nn.Module]:
+    """Build the models of the streams that are on; GAIL's learns only with an expert."""
     models: dict[str, nn.Module] = {}
     if "curiosity" in cfg.intrinsic:
         models["curiosity"] = Curiosity(obs, layout, cfg.curiosity)
     if "rnd" in cfg.intrinsic:
         models["rnd"] = RandomNetwork(obs, layout, cfg.rnd)
     if "gail" in cfg.intrinsic:
-        assert expert is not None, "GAIL learns from demonstrations"
         models["gail"] = Discriminator(obs, layout, cfg.gail, expert)
-    return [IntrinsicStream(name, model.to(device), cfg.intrinsic[name]) for name, model in models.items()]
+    return models

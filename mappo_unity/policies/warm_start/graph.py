@@ -51,6 +51,8 @@ class OnnxGraph:
         except Exception as error:  # protobuf's error, or an OSError
             reason = str(error).strip().splitlines()[0][:200]
             raise ConfigError(f"{path} is no ONNX model that can be read: {reason}") from error
+        if not self.model.graph.node:
+            raise ConfigError(f"{path} is no ONNX model that can be read: it is empty")
 
         graph = self.model.graph
         self._attribute = onnx.helper.get_attribute_value

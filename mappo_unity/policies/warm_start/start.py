@@ -51,9 +51,11 @@ def warm_start(
         except ConfigError as error:
             raise ConfigError(f"{option}: {error}") from error
 
-        if all(row.reason for row in rows):
+        # biases of other networks fit by chance: they are no start without a layer of the actor's
+        layers = [row for row in rows if row.name.startswith("actor.") and len(row.shape or ()) > 1]
+        if all(row.reason for row in layers):
             mistake = ConfigError(
-                f"{option}={where}: nothing of it fits the networks of {name}; "
+                f"{option}={where}: no layer of it fits the actor of {name}; "
                 f"behaviors.{name}.init_from=null starts {name} anew"
             )
             mistake.details = tuple(table(rows))

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from mlagents_envs.base_env import BehaviorSpec
@@ -42,7 +43,17 @@ def read_demos(paths: Sequence[str | Path]) -> Demonstration:
     files = [file for path in paths for file in _files(Path(path))]
     if not files:
         raise ConfigError("no demonstration is named: give a .demo file, several, or a folder of them")
-    return joined([_read(file) for file in files])
+
+    stats = [file.stat() for file in files]
+    key = tuple((file.absolute(), stat.st_mtime_ns, stat.st_size) for file, stat in zip(files, stats))
+    demo = _held.get(key)
+    if demo is None:
+        _held[key] = demo = joined([_read(file) for file in files])
+    return demo
+
+
+_held: WeakValueDictionary[tuple[Any, ...], Demonstration] = WeakValueDictionary()
+"""What somebody still holds of what was read: several teachers and sides learn from the same files."""
 
 
 def _files(path: Path) -> list[Path]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
 
+from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.demos.demonstration import Demonstration
 
 AGENTS = 16  # side by side at most, each with episodes of its own
@@ -57,9 +58,12 @@ class ReplayEnv(BaseEnv):
         return {name: replay.at.copy() for name, replay in self._replays.items()}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from where `get_state` stood."""
+        """Go on from where `get_state` stood; raise ConfigError where it played back other recordings."""
         for name, at in state.items():
-            self._replays[name].stand(np.asarray(at))
+            replay = self._replays.get(name)
+            if replay is None or not replay.can_stand(np.asarray(at)):
+                raise ConfigError(f"the demonstrations of {name} that were played back are others than here")
+            replay.stand(np.asarray(at))
 
 
 class _Replay:
@@ -85,6 +89,9 @@ class _Replay:
 
     def reset(self) -> None:
         self.stand(self._begin.copy())
+
+    def can_stand(self, at: np.ndarray) -> bool:
+        return len(at) == len(self._begin) and bool((at < len(self._demo)).all())
 
     def stand(self, at: np.ndarray) -> None:
         self.at = at

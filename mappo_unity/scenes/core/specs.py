@@ -19,6 +19,7 @@ from mlagents_envs.base_env import (
     ObservationType,
 )
 
+from mappo_unity.config.option_table import show_value
 from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.contract.images import ByteImage
 
@@ -100,8 +101,8 @@ def checked_parameter(scene: str, known: Mapping[str, Parameter], name: str, val
     known_parameter(scene, known, name)
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(float(value)):
         raise ConfigError(
-            f"parameter {name}={value!r} of scene {scene} must be a finite number (or, in options, a "
-            "sampler {sampler: ...} or a curriculum {lessons: [...]})"
+            f"parameter {name}={show_value(value)} of scene {scene} must be a finite number (or, in options, "
+            "a sampler {sampler: ...} or a curriculum {lessons: [...]})"
         )
 
     number = float(value)
