@@ -2,7 +2,7 @@
 """Measure what a pool of past opponents costs: decisions/s learnt, against both sides playing newest weights.
 
 Two runs of a two-sided scene's preset take turns in one process, iteration by iteration, one with
-`self_play` (a snapshot after each iteration, ten in the pool, four met at a time), one without, so that the
+`self_play` (a snapshot after each iteration, ten in the pool, three met at a time), one without, so that the
 ratio holds on a machine that is shared. Only the decisions of those who learn count.
 
     python scripts/bench_self_play.py [SoccerTwos StrikersVsGoalie] [--repeats 9] [OPTION=VALUE ...]

@@ -1,6 +1,7 @@
 """Self-play against past policies: who plays whom, the pool in files, ratings, a game without a best move."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from mappo_unity.config.schema import (
 )
 from mappo_unity.errors import ConfigError
 from mappo_unity.keys import LEARNER
-from mappo_unity.learning.networks.actor_critic import Draw
+from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.opponents import Opponents
 from mappo_unity.policies.league.ratings import expected
 from mappo_unity.runs import checkpoint
@@ -106,18 +107,33 @@ def test_the_hardest_opponents_are_drawn_most():
 
 
 class Counting:
-    """An opponent that always chooses its number, and with a memory says how often it has been asked."""
+    """An actor that always chooses its number, and with a memory says how often it has been asked."""
+
+    in_keys = [keys.FIRST]
+    layout = ActionLayout(1, ())
 
     def __init__(self, number, memory_size=0):
         self.number, self.memory_size, self.calls = number, memory_size, 0
+        self.has_memory = memory_size > 0
 
-    def draw(self, entries, deterministic=False):
+    def params(self, entries):
         self.calls += 1
-        action = torch.full((*entries.batch_size, 1), float(self.number))
         if not self.memory_size:
-            return Draw(action, torch.zeros(entries.batch_size), None, None)
+            return torch.full((*entries.batch_size, 1), float(self.number)), None
         memory = entries.get(keys.MEMORY) + 1
-        return Draw(memory.clone(), torch.zeros(entries.batch_size), None, memory)
+        return memory.clone(), memory
+
+    def distribution(self, params, entries):
+        return Mode(params)
+
+
+class Mode(NamedTuple):
+    """A distribution that draws its parameters."""
+
+    params: torch.Tensor
+
+    def sample(self):
+        return self.params
 
 
 def entries(acting, first):

@@ -639,7 +639,7 @@ class SelfPlayConfig:
     """Elo rating at the start, and of fixed opponents."""
     opponents: OpponentDraw = OpponentDraw.uniform
     """How they are drawn: uniform, or hardest: by (1 - p)^2 for a share p won against each (as AlphaStar)."""
-    num_opponents: int = 4
+    num_opponents: int = 3
     """Past opponents that are met at the same time, at most; each costs a forward pass a round."""
     fixed: list[str] = field(default_factory=list)
     """Opponents that are always in the pool: random, run folders, checkpoints, ONNX files."""

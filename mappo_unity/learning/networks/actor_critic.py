@@ -156,18 +156,25 @@ class UnityActor(ProbabilisticActor):
         between `forward` and the network cost more than the network.
         """
         with torch.no_grad():
-            inputs = [entries.get(key) for key in self.obs_keys]
-            after = None
-            if self.has_memory:
-                params, after = self.module[0].module(*inputs, entries.get(keys.MEMORY))
-            else:
-                params = self.module[0].module(*inputs)
-
-            mask = entries.get(keys.MASK) if self.layout.branches else None
-            dist = ActionDistribution(params, self.layout, mask)
+            params, after = self.params(entries)
+            dist = self.distribution(params, entries)
             action = dist.mode if deterministic else dist.sample()
             parts = dist.component_log_probs(action) if self.keeps_components else None
             return Draw(action, dist.log_prob(action), parts, after)
+
+    def params(self, entries: TensorDictBase) -> tuple[Tensor, Tensor | None]:
+        """Return the parameters of actions' distributions and, with a memory, the states after these."""
+        inputs = [entries.get(key) for key in self.obs_keys]
+        with torch.no_grad():
+            if not self.has_memory:
+                return self.module[0].module(*inputs), None
+            params, after = self.module[0].module(*inputs, entries.get(keys.MEMORY))
+            return params, after
+
+    def distribution(self, params: Tensor, entries: TensorDictBase) -> ActionDistribution:
+        """Return the distributions of actions with these parameters, masked as the entries say."""
+        mask = entries.get(keys.MASK) if self.layout.branches else None
+        return ActionDistribution(params, self.layout, mask)
 
 
 def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelConfig) -> UnityActor:

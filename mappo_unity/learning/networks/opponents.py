@@ -6,26 +6,17 @@ opponent. What opponents do is not learnt from: their agents do not act in the l
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from mappo_unity import keys
 from mappo_unity.keys import LEARNER
-from mappo_unity.learning.networks.actor_critic import Draw, UnityActor
-
-
-class Draws(Protocol):
-    """What plays for an opponent: an actor, or chance."""
-
-    memory_size: int
-
-    def draw(self, entries: TensorDictBase, deterministic: bool = False) -> Draw:
-        """Return actions for entries ``[n, A]``."""
-        ...
+from mappo_unity.learning.networks.actor_critic import UnityActor
+from mappo_unity.learning.networks.distributions import ActionLayout
 
 
 class Opponents:
@@ -39,7 +30,7 @@ class Opponents:
     """
 
     def __init__(self) -> None:
-        self.actors: dict[str, dict[int, Draws]] = {}
+        self.actors: dict[str, dict[int, Player]] = {}
         self.playing: dict[str, Tensor] = {}
         self._following: dict[str, Tensor] = {}  # likewise, who plays a team from its next episode on
         self._memories: dict[str, dict[int, Tensor]] = {}  # states [..., A, M] before an opponent's decisions
@@ -108,29 +99,51 @@ class Opponents:
             return
 
         action = entries.get(keys.ACTION).clone()
-        shape, flat = action.shape, entries.exclude(keys.ACTION, keys.LOG_PROB, keys.LOG_PROBS, keys.MEMORY)
-        flat, rows = flat.reshape(-1, shape[-2]), action.view(-1, *shape[-2:])
+        rows = action.view(-1, *action.shape[-2:])
+        drawn: dict[ActionLayout, list[tuple[Tensor, Tensor, UnityActor]]] = {}
         for number, places in self._places[name]:
-            rows[places] = self._draw(name, number, flat[places], places, asked).to(rows.dtype)
+            actor = self.actors[name][number]
+            if isinstance(actor, RandomActor):
+                rows[places] = actor.choose(_rows(entries, actor.in_keys, places)).to(rows.dtype)
+            else:
+                params = self._params(name, number, actor, entries, places, asked)
+                drawn.setdefault(actor.layout, []).append((places, params, actor))
+
+        # what is drawn alike is drawn at once: on small networks that costs more than the network
+        for parts in drawn.values():
+            places, params = (torch.cat(column) for column in zip(*[part[:2] for part in parts]))
+            actor = parts[0][2]
+            masks = _rows(entries, [keys.MASK] if actor.layout.branches else [], places)
+            rows[places] = actor.distribution(params, masks).sample().to(rows.dtype)
         entries.set(keys.ACTION, action)
 
-    def _draw(self, name: str, number: int, entries: TensorDictBase, places: Tensor, asked: Tensor) -> Tensor:
-        """Return the actions ``[n, A, *]`` of an opponent in the places ``[n]`` that it plays."""
-        actor = self.actors[name][number]
-        if not actor.memory_size:
-            return actor.draw(entries).action
+    def _params(
+        self,
+        name: str,
+        number: int,
+        actor: UnityActor,
+        entries: TensorDictBase,
+        places: Tensor,
+        asked: Tensor,
+    ) -> Tensor:
+        """Return the parameters ``[n, A, P]`` of an actor's actions in flat places; keep its memory."""
+        seen = _rows(entries, actor.in_keys, places)
+        if not actor.has_memory:
+            return actor.params(seen)[0]
 
         known = self._memories.setdefault(name, {})
         if number not in known:
             known[number] = torch.zeros(*asked.shape[:-1], actor.memory_size, device=asked.device)
         memory = known[number].view(-1, asked.shape[-2], actor.memory_size)
 
-        before = torch.where(entries.get(keys.FIRST), 0.0, memory[places])
-        drawn = actor.draw(entries.set(keys.MEMORY, before))
+        first = _rows(entries, [keys.FIRST], places).get(keys.FIRST)
+        before = torch.where(first, 0.0, memory[places])
+        params, after = actor.params(seen.set(keys.MEMORY, before))
+        assert after is not None
         # frozen while an agent is not asked
-        acting = asked.reshape(-1, asked.shape[-2], 1)[places]
-        memory[places] = before if drawn.memory is None else torch.where(acting, drawn.memory, before)
-        return drawn.action
+        acting = asked.reshape(-1, *asked.shape[-2:])[places]
+        memory[places] = torch.where(acting, after, before)
+        return params
 
     def _find_places(self, name: str) -> list[tuple[int, Tensor]]:
         flat = self.playing[name].flatten()
@@ -156,6 +169,13 @@ class Opponents:
         }
 
 
+def _rows(entries: TensorDictBase, wanted: Iterable[Any], places: Tensor) -> TensorDict:
+    """Return entries of teams ``[n, A]`` in flat places, but for memories."""
+    read = [str(key) for key in wanted if key != keys.MEMORY]
+    own = {key: entries.get(key).flatten(0, entries.batch_dims - 2)[places] for key in read}
+    return TensorDict(own, [len(places), entries.shape[-1]])
+
+
 class RandomActor:
     """Uniform actions: continuous ones within +-`limit`, one of the allowed branches for discrete ones.
 
@@ -164,14 +184,13 @@ class RandomActor:
         limit: of continuous actions, as the environment's adapter takes them.
     """
 
-    memory_size = 0
-
     def __init__(self, actor: UnityActor, limit: float) -> None:
-        self._layout, self._limit, self._obs_key = actor.layout, limit, actor.obs_keys[0]
+        self._layout, self._limit, self._device = actor.layout, limit, next(actor.parameters()).device
+        self.in_keys = [keys.MASK] if actor.layout.branches else []
 
-    def draw(self, entries: TensorDictBase, deterministic: bool = False) -> Draw:
+    def choose(self, entries: TensorDictBase) -> Tensor:
         """Return actions for entries ``[..., A]``."""
-        shape, device = entries.batch_size, entries.get(self._obs_key).device
+        shape, device = entries.batch_size, self._device
         size, branches = self._layout.continuous, self._layout.branches
 
         parts = [(torch.rand(*shape, size, device=device) * 2 - 1) * self._limit] if size else []
@@ -179,4 +198,8 @@ class RandomActor:
             # what is forbidden scores below every draw
             scores = torch.rand(*shape, sum(branches), device=device) - (~entries.get(keys.MASK)).float()
             parts += [part.argmax(-1, keepdim=True).float() for part in scores.split(list(branches), -1)]
-        return Draw(torch.cat(parts, -1), torch.zeros(shape, device=device), None, None)
+        return torch.cat(parts, -1)
+
+
+Player = UnityActor | RandomActor
+"""What plays for an opponent."""

@@ -11,7 +11,7 @@ from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT
-from mappo_unity.learning.networks.opponents import Draws, RandomActor
+from mappo_unity.learning.networks.opponents import Player, RandomActor
 from mappo_unity.policies.layouts import check_layout
 from mappo_unity.policies.policy import actor_of
 from mappo_unity.policies.policy_files import SUFFIX, Kind, choose_checkpoint, locate
@@ -23,7 +23,7 @@ OPTION = "self_play.fixed"
 
 def load_fixed(
     where: str, specs: Mapping[str, BehaviorSpec], actors: Mapping[str, UnityActor], device: str
-) -> dict[str, Draws]:
+) -> dict[str, Player]:
     """Return who plays for an entry of `self_play.fixed`, by policy name.
 
     Args:

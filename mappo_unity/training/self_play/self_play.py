@@ -18,7 +18,7 @@ import torch
 from mappo_unity import keys
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.networks.opponents import Draws, Opponents
+from mappo_unity.learning.networks.opponents import Opponents, Player
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.policies.layouts import sides_of
 from mappo_unity.policies.league.growing import step_name
@@ -189,7 +189,7 @@ class SelfPlay:
         for number in self._opponents.used(name) - known.keys():
             known[number] = self._make_actor(name, number)
 
-    def _make_actor(self, name: str, number: int) -> Draws:
+    def _make_actor(self, name: str, number: int) -> Player:
         learner = self._setup.learners[name].actor
         if number == LATEST:
             return learner
@@ -201,7 +201,7 @@ class SelfPlay:
         actor.load_state_dict(self._pool.tensors(number, name))
         return actor.eval()
 
-    def _load_fixed(self) -> dict[int, dict[str, Draws]]:
+    def _load_fixed(self) -> dict[int, dict[str, Player]]:
         env, learners = self._setup.env, self._setup.learners
         specs = {sides[0]: env.behaviors[sides[0]].spec for n, sides in env.sides.items() if n in self._names}
         actors = {name: learner.actor for name, learner in learners.items()}
