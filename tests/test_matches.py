@@ -1,5 +1,6 @@
 """Matches: outcomes, sides, intervals."""
 
+import matrix_game
 import numpy as np
 import pytest
 from fakes import behavior_spec
@@ -115,3 +116,31 @@ def test_random_play_in_the_soccer_scenes_is_even():
         assert sum(s.matches for s in scores.values()) == 4
         if name == "StrikersVsGoalie":  # the goalie's side cannot score
             assert scores["Goalie?team=1"].wins == 0 and scores["Striker?team=0"].losses == 0
+
+
+class LeftBehind(matrix_game.MatrixGame):
+    """A game whose later resets go on from where it stands: the match under way then is lost by both."""
+
+    is_used = stale = False
+
+    def reset(self):
+        super().reset()
+        self.stale = self.is_used
+
+    def step(self):
+        self.stale = self.stale and not self.played
+        self.is_used = True
+        super().step()
+
+    def get_steps(self, behavior_name):
+        decision, terminal = super().get_steps(behavior_name)
+        terminal.reward[:] = -1.0 if self.stale else 1.0
+        return decision, terminal
+
+
+def test_matches_that_begin_with_the_reset_of_a_used_environment_do_not_count():
+    policy = RandomPolicy(0)
+    scores = play_matches(lambda seed: LeftBehind(seed, games=4), policy, policy, 16, seed=0)
+    assert {side: (score.wins, score.losses) for side, score in scores.items()} == dict.fromkeys(
+        matrix_game.SIDES, (8, 0)
+    )

@@ -1,6 +1,10 @@
 """Self-play against past policies: who plays whom, the pool in files, ratings, a game without a best move."""
 
+import os
+import random
+import time
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +12,7 @@ import pytest
 import torch
 from matrix_game import EQUILIBRIUM
 from tensordict import TensorDict
-from test_train import assert_same, options, rows, without_times
+from test_train import assert_same, options, rows, start, wait_for_rows, without_times
 
 from mappo_unity import keys
 from mappo_unity.cli import eval_main, train_main
@@ -36,6 +40,12 @@ from mappo_unity.training.trainer import train
 
 GAMES = 8
 SIDES = {0: ["A?team=0"], 1: ["A?team=1"]}
+HERE = Path(__file__).parent
+GAME = [
+    "env=custom", "env.name=Rps", "env.factory=matrix_game:make", "env.params.games=8", "model.hidden=[8]",
+    "collect.batch_size=64", "self_play.save_steps=64", "self_play.swap_steps=0", "export_onnx=false",
+    "log.loggers=[]",
+]  # fmt: skip
 
 
 def matrix_game(iterations, games=GAMES, rounds=4, **changes):
@@ -272,13 +282,13 @@ def test_two_scenes_with_two_sides_learn_with_a_pool(tmp_path):
 
 
 def test_files_that_are_missing_or_damaged_are_told_and_left_out_only_if_asked(tmp_path, capsys):
-    options = [
-        "env=custom", "env.name=Rps", "env.factory=matrix_game:make", "env.params.games=8",
-        "model.hidden=[8]", "collect.batch_size=64", "self_play.save_steps=64", "self_play.swap_steps=0",
-        "self_play.play_against_latest_model_ratio=0", "export_onnx=false", "log.loggers=[]",
-    ]  # fmt: skip
     run = tmp_path / "run"
-    assert train_main([*options, "max_steps=256", f"hydra.run.dir={run}"]) == 0
+    assert (
+        train_main(
+            [*GAME, "self_play.play_against_latest_model_ratio=0", "max_steps=256", f"hydra.run.dir={run}"]
+        )
+        == 0
+    )
     files = sorted((run / "pool").iterdir())
     assert eval_main([f"run={files[-1]}", "opponent=random", "episodes=10"]) == 0
     capsys.readouterr()
@@ -328,6 +338,42 @@ def test_a_checkpoint_of_another_environment_is_no_fixed_opponent(tmp_path):
     cfg = matrix_game(1, self_play=SelfPlayConfig(fixed=[str(outcome.last_checkpoint)]))
     with pytest.raises(ConfigError, match=r"self_play.fixed: checkpoint .* cannot play 'Rps\?team="):
         train(cfg, tmp_path / "run")
+
+
+def finish(process):
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment_a_run_has_the_same_pool_and_ratings(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")]))
+    lines = [
+        *GAME, "max_steps=9600", "checkpoint_interval=320", "matches.interval=960", "matches.count=4",
+        "self_play.window=5", "log.progress=false", "hydra.run.dir=run",
+    ]  # fmt: skip
+    for name in ("whole", "cut"):
+        (tmp_path / name).mkdir()
+    finish(start(tmp_path / "whole", *lines))
+
+    generator, arguments, reached = random.Random(0), lines, 5
+    for _ in range(6):
+        process = start(tmp_path / "cut", *arguments)
+        wait_for_rows(tmp_path / "cut", reached + generator.randint(1, 10), process)
+        time.sleep(generator.uniform(0.0, 0.1))
+        process.kill()
+        process.communicate()
+        reached = len((tmp_path / "cut" / "run" / "metrics.csv").read_text().splitlines())
+        arguments = ["resume=run"]
+    finish(start(tmp_path / "cut", *arguments))
+
+    whole, cut = (tmp_path / name / "run" for name in ("whole", "cut"))
+    assert rows(whole) == rows(cut) and "rating" in rows(whole)[-1]
+    states = [checkpoint.load(checkpoint.newest_good(run)[0]) for run in (whole, cut)]
+    assert_same(*(state["self_play"] for state in states))
+    assert_same(*(state["matches"] for state in states))
+    files = [{p.name: p.stat().st_size for p in (run / "pool").iterdir()} for run in (whole, cut)]
+    assert files[0].items() <= files[1].items()  # what a kill left behind between two checkpoints may stay
 
 
 # --- a game without a best pure strategy

@@ -20,11 +20,23 @@ MIN_BATCH = 10  # episodes
 
 
 def play(
-    env: BaseEnv, policy: Policy | dict[str, Policy], episodes: int, only: str | None = None
+    env: BaseEnv,
+    policy: Policy | dict[str, Policy],
+    episodes: int,
+    only: str | None = None,
+    skip_first: bool = False,
 ) -> dict[str, list[Episode]]:
     """Play until the first ``episodes`` episodes *begun* of every behavior (or of ``only``) have ended.
 
     Counting the first ones begun, not the first ones ended, gives long episodes their due weight.
+
+    Args:
+        env: what is played in; it is reset first.
+        policy: who plays, everybody or by behavior.
+        episodes: how many count.
+        only: the behavior that they are counted of; None: every one.
+        skip_first: whether those that begin with the reset do not count. An environment that has been played
+            in may go on from where its areas stand: Unity's own reset of the academy moves no ball.
 
     Returns:
         The episodes of every behavior, in the order of their ends.
@@ -34,7 +46,7 @@ def play(
         EnvironmentFailure: so many episodes do not end.
     """
     running: dict[tuple[str, int], list[float]] = {}
-    counts = _Counts(episodes)
+    counts = _Counts(episodes, skip_first)
     checks: dict[str, RecordCheck] = {}
     silent = 0  # steps in a row in which nobody requested a decision
 
@@ -56,6 +68,7 @@ def play(
                 env.set_actions(name, actor.act(name, decision, env.behavior_specs[name]))
 
         names = [only] if only else list(env.behavior_specs)
+        counts.skips = False
         if names and counts.complete(names):
             return counts.ended
         note_silence(silent, MAX_SILENT_STEPS)
@@ -71,14 +84,16 @@ def play(
 
 
 class _Counts:
-    """Which episodes count: the first ``wanted`` begun of each behavior."""
+    """Which episodes count: the first ``wanted`` begun of each behavior; none while it ``skips``."""
 
-    def __init__(self, wanted: int) -> None:
-        self.wanted = wanted
+    def __init__(self, wanted: int, skips: bool) -> None:
+        self.wanted, self.skips = wanted, skips
         self.begun: dict[str, int] = {}
         self.ended: dict[str, list[Episode]] = {}
 
     def begin(self, name: str) -> bool:
+        if self.skips:
+            return False
         self.begun[name] = self.begun.get(name, 0) + 1
         return self.begun[name] <= self.wanted
 

@@ -83,7 +83,7 @@ def play_matches(
             policies = dict.fromkeys(own, policy) | dict.fromkeys(other, opponent)
             # Of an odd number of matches the first side gets one more.
             count = (matches + 1 - index) // 2
-            scores["+".join(own)] = play_side(env, policies, own, max(1, count))
+            scores["+".join(own)] = play_side(env, policies, own, max(1, count), is_used=index > 0)
     finally:
         env.close()
 
@@ -100,15 +100,21 @@ def find_sides(env: BaseEnv) -> dict[int, list[str]]:
     return check_two_sides(env.behavior_specs)
 
 
-def play_side(env: BaseEnv, policies: dict[str, Policy], own: list[str], matches: int) -> Score:
-    """Play until the first ``matches`` team episodes begun by the first of our behaviors have ended."""
+def play_side(
+    env: BaseEnv, policies: dict[str, Policy], own: list[str], matches: int, is_used: bool = False
+) -> Score:
+    """Play until the first ``matches`` team episodes begun by the first of our behaviors have ended.
+
+    In an environment that is used, where matches have been played before, those that the reset begins do not
+    count: the ball lies where the other side has left it.
+    """
     name = own[0]
     env.reset()
     groups = env.get_steps(name)[0].group_id
     # Group 0 is none: without teams the match of an agent is its own episode.
     members = max(1, int((groups == groups[0]).sum())) if groups[0] > 0 else 1
     # Each member of a team has an agent episode of its own in every match.
-    episodes = play(env, policies, matches * members, only=name)[name]
+    episodes = play(env, policies, matches * members, only=name, skip_first=is_used)[name]
     return count(episodes, grouped=bool(groups[0] > 0))
 
 
