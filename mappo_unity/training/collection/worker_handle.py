@@ -26,6 +26,8 @@ from mappo_unity.training.collection.worker_process import (
 
 LOOK_S = 1.0
 """Between two looks at a worker's pulse."""
+END_S = 5.0
+"""Within which a process whose pipe is closed has ended."""
 
 
 class WorkerLost(Exception):
@@ -40,10 +42,12 @@ class WorkerProcess:
         number: of the worker.
         folder: of the run.
         restarts: how often the worker was replaced.
+
+    Attributes: `timeout_s`, seconds without a round after which it is lost.
     """
 
     def __init__(self, cfg: Config, number: int, folder: Path, restarts: int = 0) -> None:
-        self._timeout_s = cfg.collect.timeout_s
+        self.timeout_s = cfg.collect.timeout_s
         self._shared = SharedBytes(PULSE_BYTES)
         self._pulse = self._shared.bytes.view(torch.int64)
 
@@ -86,13 +90,12 @@ class WorkerProcess:
         rounds, since = int(self._pulse[ROUNDS]), time.monotonic()
         connection: Connection = self._pipe
         while True:
-            ready = wait([connection, self._process.sentinel], min(LOOK_S, self._timeout_s))
+            ready = wait([connection, self._process.sentinel], min(LOOK_S, self.timeout_s))
             if connection in ready:
                 try:
                     message: tuple[str, Any] = pickle.loads(connection.recv_bytes())
                     return message
                 except (EOFError, OSError):
-                    self._process.join(LOOK_S)
                     raise WorkerLost(f"its process ended with {self._end()}") from None
             if ready:
                 raise WorkerLost(f"its process ended with {self._end()}")
@@ -100,8 +103,8 @@ class WorkerProcess:
             now, before = int(self._pulse[ROUNDS]), rounds
             if now != before:
                 rounds, since = now, time.monotonic()
-            elif time.monotonic() - since > self._timeout_s:
-                raise WorkerLost(f"it has played no round for collect.timeout_s={self._timeout_s:g} s")
+            elif time.monotonic() - since > self.timeout_s:
+                raise WorkerLost(f"it has played no round for collect.timeout_s={self.timeout_s:g} s")
 
     def stop(self) -> None:
         """Ask it to close its environment and end, also in the middle of a batch."""
@@ -119,5 +122,6 @@ class WorkerProcess:
         self._shared.close()
 
     def _end(self) -> str:
+        self._process.join(END_S)
         code = self._process.exitcode
         return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
