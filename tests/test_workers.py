@@ -313,7 +313,8 @@ def test_errors_keep_their_type_on_their_way_to_the_driver() -> None:
 @pytest.mark.slow
 def test_a_driver_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
     lines = [*SOCCER, "collect.overlap=true", "max_steps=100000000", f"hydra.run.dir={tmp_path / 'run'}"]
-    code = f"from mappo_unity.cli import train_main\nif __name__ == '__main__': train_main({lines!r})\n"
+    # no `if __name__ == "__main__"`: workers do not import the script
+    code = f"from mappo_unity.cli import train_main\ntrain_main({lines!r})\n"
     script = tmp_path / "script.py"
     script.write_text(code)
     driver = subprocess.Popen([sys.executable, str(script)], cwd=tmp_path, stdout=subprocess.DEVNULL)

@@ -19,6 +19,8 @@ from mappo_unity.training.collection.description import Played, describe
 BATCH_COPIES = 4
 """Memory of a batch in units of its observations: as collected, behind the rounds that are carried, the rows
 that are learnt, and what the networks make of them."""
+SHARED_COPIES = 2
+"""Further copies with workers in processes: two sets of shared memory."""
 WEIGHT_COPIES = 10
 """Memory of learning in units of the weights: gradients, two moments of Adam, and two copies of weights and
 moments, to roll an update back and to save the last complete iteration."""
@@ -52,9 +54,10 @@ def check_batch_memory(cfg: Config, env: Played, rounds: int) -> None:
     value = getattr(cfg.collect, option)
     seen = describe(env)
     one_round = seen.round_bytes
+    copies = BATCH_COPIES + SHARED_COPIES * (cfg.collect.workers > 0)
     check_free(
         # the critic reads all images at once, and as floats
-        (BATCH_COPIES * one_round + seen.float_bytes) * rounds,
+        (copies * one_round + seen.float_bytes) * rounds,
         f"collect.{option}={value}: learning from a batch of {rounds:,} rounds of {show_size(one_round)}",
         f"lower collect.{option}, or env.num_areas where the environment has it",
     )

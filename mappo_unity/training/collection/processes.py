@@ -132,8 +132,11 @@ class WorkerProcesses(SeveralWorkers):
     def _load(self, states: list[Mapping[str, Any]]) -> None:
         for process, state in zip(self.processes, states):
             process.send("load", state)
-        for process in self.processes:
-            process.receive()
+        for number, process in enumerate(self.processes):
+            try:
+                process.receive()
+            except WorkerLost as loss:
+                raise EnvironmentFailure(f"worker {number} cannot be resumed: {loss}") from loss
 
     # --- answers and losses
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import pickle
+import signal
+import sys
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -56,7 +60,8 @@ class WorkerProcess:
         self._pipe, theirs = context.Pipe()
         arguments = (cfg, number, folder, restarts, self._shared.path, theirs)
         self._process = context.Process(target=main, args=arguments, name=f"worker-{number}")
-        self._process.start()
+        with _interrupts_blocked(), _without_main():
+            self._process.start()
         theirs.close()
 
     @property
@@ -125,3 +130,27 @@ class WorkerProcess:
         self._process.join(END_S)
         code = self._process.exitcode
         return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Let a process that is started here begin with SIGINT blocked, until it can take it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Let a process that is started here not import the program: a script would begin to train there, too."""
+    before = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = before

@@ -68,6 +68,8 @@ def main(cfg: Config, number: int, folder: Path, restarts: int, pulse: str, pipe
     # the driver's business; not SIG_IGN, which players would inherit
     for signal_number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signal_number, lambda number, frame: None)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     torch.set_num_threads(cfg.num_threads)
     seed_everything(worker_config(cfg, number, restarts).seed)
@@ -128,7 +130,10 @@ class _Serving:
         length = rounds.shape[0]
         if which not in self._slabs or self._slabs[which][0].capacity < length:
             self._send(SPACE, (length, rows_of(rounds)))
-            _, path, layout = pickle.loads(self._pipe.recv_bytes())
+            message = pickle.loads(self._pipe.recv_bytes())
+            if message[0] == CLOSE:
+                raise _Stopped
+            _, path, layout = message
             self._slabs[which] = layout, open_bytes(path, layout.size)
 
         layout, block = self._slabs[which]
