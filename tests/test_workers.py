@@ -247,7 +247,7 @@ def learnt(learner: Any, batch: Batch) -> list[tuple[float, ...]]:
 
 
 def test_a_resumed_run_with_workers_is_the_whole_one(tmp_path: Path) -> None:
-    check_resume(tmp_path, "env=DungeonEscape", "env.num_areas=2", LOCAL)
+    check_resume(tmp_path, "env=DungeonEscape", "env.num_areas=2", "model.memory=gru", LOCAL)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ with rounds in which nobody acts, which nothing is learnt from; its last row is 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -50,6 +51,18 @@ def join_batches(
         sum(counted) if counted else None,
         sum(batch.dropped_episodes for batch in batches),
         sum(batch.dropped_steps for batch in batches),
+    )
+
+
+def on_device(batch: Batch, device: str) -> Batch:
+    """Return a batch of the CPU with its tensors on a device."""
+    if device == "cpu":
+        return batch
+    return replace(
+        batch,
+        rounds=batch.rounds.to(device),
+        following={name: part.to(device) for name, part in batch.following.items()},
+        void={name: slots.to(device) for name, slots in batch.void.items()},
     )
 
 

@@ -22,8 +22,7 @@ from mappo_unity.keys import ACTING
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.description import Description
-from mappo_unity.training.collection.joining import join_batches
-from mappo_unity.training.collection.several_workers import SeveralWorkers, packed
+from mappo_unity.training.collection.several_workers import Answers, SeveralWorkers, packed
 from mappo_unity.training.collection.slab import Layout, SharedBytes, make_layout
 from mappo_unity.training.collection.worker import Weights
 from mappo_unity.training.collection.worker_handle import WorkerLost, WorkerProcess
@@ -103,7 +102,7 @@ class WorkerProcesses(SeveralWorkers):
         for process in self.processes:
             process.send(*self._asked)
 
-    def _answers(self) -> tuple[Batch, list[dict[str, Any] | None]]:
+    def _answers(self) -> Answers:
         batches, states, written = [], [], []
         for number in range(len(self.processes)):
             (batch, length, capacity), state = self._until_answered(number)
@@ -116,12 +115,8 @@ class WorkerProcesses(SeveralWorkers):
         self._asked = None
         self._lost.clear()
 
-        rounds = None
-        if len(set(written)) == 1:  # side by side already
-            rounds = layout.rounds(block.bytes, length)
-        batch = join_batches(batches, self._parts, rounds)
-        batch.rounds = batch.rounds.to(self._cfg.device)
-        return batch, states
+        is_joined = len(set(written)) == 1
+        return Answers(batches, states, layout.rounds(block.bytes, length) if is_joined else None)
 
     def _call(self, method: str, *arguments: Any) -> list[Any]:
         assert self._asked is None, "a worker that collects answers nothing else"

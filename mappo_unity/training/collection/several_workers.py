@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+from tensordict import TensorDictBase
 
 from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.config.schema import Config
@@ -16,8 +19,16 @@ from mappo_unity.runs.rng import get_rng_state, seed_everything, set_rng_state
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.description import Description, join_descriptions
 from mappo_unity.training.collection.fleet import Fleet
-from mappo_unity.training.collection.joining import join_batches
+from mappo_unity.training.collection.joining import join_batches, on_device
 from mappo_unity.training.collection.worker import Message, Weights, Worker, make_worker, worker_config
+
+
+class Answers(NamedTuple):
+    """What workers have collected."""
+
+    batches: list[Batch]
+    states: list[dict[str, Any] | None]
+    rounds: TensorDictBase | None  # of all of them, where they lie side by side already
 
 
 class SeveralWorkers(Fleet):
@@ -44,10 +55,10 @@ class SeveralWorkers(Fleet):
         self._ask(weights, want_state)
 
     def receive(self) -> Batch:
-        """Wait for the batches, and join them."""
-        batch, self._states = self._answers()
+        """Wait for the batches, and join them, on the learners' device."""
+        batches, self._states, rounds = self._answers()
         self._is_requested = False
-        return batch
+        return on_device(join_batches(batches, self._parts, rounds), self._cfg.device)
 
     def set_parameter(self, name: str, value: Value) -> None:
         """Set an environment parameter everywhere."""
@@ -77,7 +88,7 @@ class SeveralWorkers(Fleet):
     def _ask(self, weights: Weights | None, want_state: bool) -> None: ...
 
     @abstractmethod
-    def _answers(self) -> tuple[Batch, list[dict[str, Any] | None]]: ...
+    def _answers(self) -> Answers: ...
 
     @abstractmethod
     def _call(self, method: str, *arguments: Any) -> list[Any]:
@@ -121,14 +132,12 @@ class LocalWorkers(SeveralWorkers):
     def _ask(self, weights: Weights | None, want_state: bool) -> None:
         self._want_state = want_state
 
-    def _answers(self) -> tuple[Batch, list[dict[str, Any] | None]]:
+    def _answers(self) -> Answers:
         messages: list[Message] = []
         for number, worker in enumerate(self._workers):
             with self._drawing(number):
                 messages.append(worker.collect(self._weights, self._want_state))
-        batch = join_batches([message.batch for message in messages], self._parts)
-        batch.rounds = batch.rounds.to(self._cfg.device)
-        return batch, [message.state for message in messages]
+        return Answers([message.batch for message in messages], [message.state for message in messages], None)
 
     def _call(self, method: str, *arguments: Any) -> list[Any]:
         out = []
@@ -155,12 +164,4 @@ class LocalWorkers(SeveralWorkers):
 
 def packed(policy: JointPolicy) -> bytes:
     """Return a policy as bytes, whose copy lies on the CPU."""
-    before = {parameter.device for parameter in policy.parameters()}
-    if all(device.type == "cpu" for device in before):
-        return pickle.dumps(policy)
-
-    (device,) = before
-    try:
-        return pickle.dumps(policy.cpu())
-    finally:
-        policy.to(device)
+    return pickle.dumps(copy.deepcopy(policy).cpu())
