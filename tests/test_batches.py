@@ -27,8 +27,9 @@ from mappo_unity.envs.following import followed
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.learning.minibatches import EvenSampler, minibatch_count
 from mappo_unity.training.collection.batches import BatchCollector
+from mappo_unity.training.collection.worker import make_collector
 from mappo_unity.training.learners import make_learners
-from mappo_unity.training.setup import make_collector, set_up
+from mappo_unity.training.setup import set_up
 
 
 def slow_agents(seed: int, every: int = 5, agents: int = 10) -> Any:

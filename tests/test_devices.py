@@ -42,6 +42,7 @@ RUNS = {
     "SoccerTwos": (["env=SoccerTwos", "env.num_areas=1", "matches.interval=1"], 96),
     "Hallway": (["env=Hallway", "env.num_areas=2", "ppo.sequence_length=4"], 48),
     "DungeonEscape": (ROOM, 72),
+    "workers": ([*BALL, "collect.workers=2", "collect.engine=local"], 96),
     "remembering": ([*ROOM, "model.memory=gru", "ppo.sequence_length=4"], 72),
     "sensors": (
         [*SENSES, "model.goal_conditioning=hyper", "rewards.curiosity.strength=0.1", "collect.rounds=2"],

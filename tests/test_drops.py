@@ -19,7 +19,7 @@ from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.scenes import make_scene
 from mappo_unity.training.collection.crashed_episodes import episode_rows, mask_crashed_episodes
-from mappo_unity.training.setup import make_collector
+from mappo_unity.training.collection.worker import make_collector
 
 FAKE = "Fake?team=0"
 

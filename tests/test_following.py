@@ -29,7 +29,8 @@ from mappo_unity.envs.following import FollowedEnv
 from mappo_unity.envs.transforms import make_transforms
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.training.collection.batches import BatchCollector
-from mappo_unity.training.setup import make_collector, set_up
+from mappo_unity.training.collection.worker import make_collector
+from mappo_unity.training.setup import set_up
 
 NAMES = ("One?team=0", "Soccer?team=0", "Soccer?team=1")
 MODELS: list[dict[str, Any]] = [

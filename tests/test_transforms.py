@@ -16,7 +16,7 @@ from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.scenes import make_scene
-from mappo_unity.training.setup import make_collector
+from mappo_unity.training.collection.worker import make_collector
 
 END, CUT = "terminated", "interrupted"
 

@@ -8,7 +8,7 @@ from operator import attrgetter
 from typing import Any
 
 from mappo_unity.config.option_table import show_value
-from mappo_unity.config.schema import BACKENDS, Backend, Config, EnvConfig
+from mappo_unity.config.schema import BACKENDS, Backend, Config, Engine, EnvConfig
 from mappo_unity.errors import ConfigError
 
 
@@ -24,6 +24,7 @@ def check_effect(given: Iterable[str], configs: list[Config]) -> None:
     """
     given = list(given)
     _check_backends(given, configs)
+    _check_workers(given, configs)
     _check_teachers(given, configs)
 
 
@@ -36,12 +37,33 @@ def _check_backends(given: list[str], configs: list[Config]) -> None:
         needed = looked_at.get(name) if section == "env" else None
         if needed is None or set(needed) & set(backends):
             continue
+        # workers' processes are started again with every backend
+        if key == "env.max_restarts" and any(_has_processes(config) for config in configs):
+            continue
 
         # giving the default changes nothing, so it is no mistake with any backend
         default = getattr(EnvConfig(), name)
         for value in (getattr(config.env, name) for config in configs):
             if value != default:
                 raise ConfigError(_message(key, value, backends, needed))
+
+
+def _check_workers(given: list[str], configs: list[Config]) -> None:
+    """Refuse options of workers' processes where there are none."""
+    if any(_has_processes(config) for config in configs):
+        return
+    for config in configs:
+        asks = config.collect.engine is Engine.processes and not config.collect.workers
+        if "collect.timeout_s" in given or ("collect.engine" in given and asks):
+            key = "collect.timeout_s" if "collect.timeout_s" in given else "collect.engine"
+            raise ConfigError(
+                f"{_shown(key, config)} has no effect without processes of workers: give collect.workers=2 "
+                "(with collect.engine=processes), or leave it out"
+            )
+
+
+def _has_processes(config: Config) -> bool:
+    return config.collect.workers > 0 and config.collect.engine is Engine.processes
 
 
 def _message(key: str, value: Any, backends: list[Backend], needed: tuple[Backend, ...]) -> str:

@@ -184,7 +184,8 @@ class EnvConfig:
     num_players: int = field(default=1, metadata=_STARTED)
     """Players that run side by side, their agents in one batch."""
     max_restarts: int = field(default=20, metadata=_UNITY)
-    """Times that each player is started again in a run after it crashed, hung or sent nonsense."""
+    """Times that each player is started again in a run after it crashed, hung or sent nonsense; and each
+    worker's process (collect.workers)."""
     timeout_s: float = field(default=60.0, metadata=_UNITY)
     """Seconds within which a player (or the Editor) must connect, and must answer."""
     port: Optional[int] = field(default=None, metadata={BACKENDS: (Backend.editor,)})
@@ -596,6 +597,13 @@ class RewardsConfig:
         return {name: stream for name, stream in streams.items() if stream.strength > 0}
 
 
+class Engine(Enum):
+    """Where workers run."""
+
+    local = "local"
+    processes = "processes"
+
+
 @dataclass
 class CollectConfig:
     """Collecting experience."""
@@ -604,10 +612,25 @@ class CollectConfig:
     """Agent decisions in a batch at least (ML-Agents' buffer_size)."""
     rounds: Optional[int] = None
     """Rounds (environment steps) in a batch, instead of collect.batch_size: rounds x agents decisions."""
+    workers: int = 0
+    """Workers that share env.num_areas or env.num_players; 0: one environment in this process."""
+    engine: Engine = Engine.processes
+    """Where workers run: each in its own process (processes), or one after another in this one (local)."""
+    overlap: bool = False
+    """Workers collect the next batch while this one is learnt from, with the weights before it."""
+    timeout_s: float = 300.0
+    """Seconds after which a worker's process that plays no round is replaced, see env.max_restarts."""
 
     def __post_init__(self) -> None:
         _at_least("collect.batch_size", self.batch_size, 1)
         _at_least("collect.rounds", self.rounds, 1)
+        _at_least("collect.workers", self.workers, 0)
+        _above("collect.timeout_s", self.timeout_s, 0)
+        if self.overlap and (not self.workers or self.engine is not Engine.processes):
+            raise ConfigError(
+                "collect.overlap=true needs collect.workers=1 or more with collect.engine=processes: in one "
+                "process nothing is collected while it learns"
+            )
 
 
 class OpponentDraw(Enum):
@@ -769,6 +792,53 @@ class Config:
             raise ConfigError(f"device={self.device!r} must be one of cpu, cuda, cuda:N")
         if self.bc.only:
             self._check_cloning()
+        if self.collect.workers:
+            self._check_workers()
+
+    def _check_workers(self) -> None:
+        what, env = f"collect.workers={self.collect.workers}", self.env
+        own = [section.get("ppo") for section in self.behaviors.values() if isinstance(section, dict)]
+        moving = [ppo.get("obs_norm_update") for ppo in own if isinstance(ppo, dict)]
+        if self.ppo.obs_norm_update is ObsNormUpdate.round or "round" in moving:
+            raise ConfigError(
+                f"{what} does not go with ppo.obs_norm_update=round: the normalisers of workers would drift "
+                "apart; give ppo.obs_norm_update=batch, or leave collect.workers out"
+            )
+        if self.self_play.is_on:
+            raise ConfigError(
+                f"{what} does not go with self_play yet: opponents play in one process; leave one of the two "
+                "out"
+            )
+        if self.bc.only:
+            raise ConfigError(f"{what} does not go with bc.only=true, where nothing is played; leave it out")
+        lessons = curricula(env.parameters)
+        if self.collect.overlap and lessons:
+            raise ConfigError(
+                f"env.params.{next(iter(lessons))} has lessons, which do not go with collect.overlap=true: "
+                "the next batch would begin before its lesson is known; give collect.overlap=false"
+            )
+        self._check_shares(what)
+
+    def _check_shares(self, what: str) -> None:
+        """Refuse workers among which the environment cannot be shared evenly."""
+        env, workers = self.env, self.collect.workers
+        if env.backend is Backend.editor and workers > 1:
+            raise ConfigError(f"{what} does not go with env.backend=editor: there is one Editor")
+
+        shared: Optional[int] = None
+        if env.backend is Backend.embedded:
+            key, shared = "env.num_areas", env.num_areas
+            if shared is None:
+                raise ConfigError(f"{what} shares the areas: give env.num_areas, a multiple of {workers}")
+        elif env.backend in (Backend.player, Backend.registry):
+            key, shared = "env.num_players", env.num_players
+        if shared is not None and shared % workers:
+            below, above = shared // workers * workers, -(-shared // workers) * workers
+            choices = f"{below} or {above}" if below else f"{above}"
+            raise ConfigError(
+                f"{key}={shared} cannot be shared by {what}: it must be a multiple of {workers}, such as "
+                f"{choices}"
+            )
 
     def _check_cloning(self) -> None:
         own = [section.get("bc") for section in self.behaviors.values() if isinstance(section, dict)]

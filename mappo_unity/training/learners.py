@@ -9,7 +9,6 @@ from mlagents_envs.base_env import BehaviorSpec, ObservationSpec
 from mappo_unity.config.per_behavior import behavior_config, check_behaviors
 from mappo_unity.config.schema import Config, CriticKind, PPOConfig
 from mappo_unity.envs.replay import read_fitting
-from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.imitation.cloning import Cloning
 from mappo_unity.learning.imitation.expert import Expert, make_expert
@@ -20,12 +19,13 @@ from mappo_unity.learning.networks.images import check_sides
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.rewards.streams import RewardStreams, make_intrinsic
 from mappo_unity.scenes.contract.images import looks_unmarked
+from mappo_unity.training.collection.description import Played
 from mappo_unity.training.memory import check_batch_memory, check_network_memory
 
 
 def make_learners(
     cfg: Config,
-    env: UnityEnv,
+    env: Played,
     rounds: int,
     note: Callable[[str], None],
     guess_channels: bool = False,

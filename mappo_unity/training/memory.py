@@ -9,16 +9,18 @@ import torch
 from torch import nn
 
 from mappo_unity.config.schema import Config, ModelConfig, RewardsConfig
-from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.actor_critic import make_actor, make_critic
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.rewards.streams import make_models
+from mappo_unity.training.collection.description import Played, describe
 
 BATCH_COPIES = 4
 """Memory of a batch in units of its observations: as collected, behind the rounds that are carried, the rows
 that are learnt, and what the networks make of them."""
+SHARED_COPIES = 2
+"""Further copies with workers in processes: two sets of shared memory."""
 WEIGHT_COPIES = 10
 """Memory of learning in units of the weights: gradients, two moments of Adam, and two copies of weights and
 moments, to roll an update back and to save the last complete iteration."""
@@ -46,16 +48,16 @@ def check_free(needed: float, what: str, remedy: str) -> None:
         raise ConfigError(f"{what} takes about {show_size(needed)}, but {show_size(free)} are free; {remedy}")
 
 
-def check_batch_memory(cfg: Config, env: UnityEnv, rounds: int) -> None:
+def check_batch_memory(cfg: Config, env: Played, rounds: int) -> None:
     """Raise ConfigError if a batch does not fit into the memory that is free."""
     option = "batch_size" if cfg.collect.rounds is None else "rounds"
     value = getattr(cfg.collect, option)
-    root = env.root()
-    one_round = root.bytes()
-    # the critic reads all images at once, and as floats
-    as_floats = sum(4 * entry.nbytes for entry in root.values(True, True) if entry.dtype == torch.uint8)
+    seen = describe(env)
+    one_round = seen.round_bytes
+    copies = BATCH_COPIES + SHARED_COPIES * (cfg.collect.workers > 0)
     check_free(
-        (BATCH_COPIES * one_round + as_floats) * rounds,
+        # the critic reads all images at once, and as floats
+        (copies * one_round + seen.float_bytes) * rounds,
         f"collect.{option}={value}: learning from a batch of {rounds:,} rounds of {show_size(one_round)}",
         f"lower collect.{option}, or env.num_areas where the environment has it",
     )

@@ -8,13 +8,13 @@ from typing import Any
 
 from mappo_unity.config.option_table import show_value
 from mappo_unity.config.schema import ModelConfig, bounded_log_std
-from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.policies.layouts import describe_spec, same_layout
 from mappo_unity.runs.checkpoint import CheckpointError
+from mappo_unity.training.collection.description import Played
 
 
-def describe_policies(env: UnityEnv) -> dict[str, Any]:
+def describe_policies(env: Played) -> dict[str, Any]:
     """Return what a network must fit: sensors, actions and team size of every policy name."""
     out = {}
     for name, sides in env.sides.items():
@@ -73,6 +73,21 @@ def check_streams(path: Path, saved: dict[str, Any], learners: dict[str, PolicyL
                     "layers cannot change with resume; here "
                     + ", ".join(f"{option}={show_value(value)}" for option, value in options.items())
                 )
+
+
+def check_workers(path: Path, state: dict[str, Any], workers: int) -> None:
+    """Refuse a checkpoint of another number of workers: its environments are others."""
+    saved = len(state.get("workers", []))
+    if saved != workers:
+        raise CheckpointError(
+            f"checkpoint {path} was written with collect.workers={saved}, which cannot change with resume; "
+            f"here it is {workers}"
+        )
+
+
+def has_snapshot(state: dict[str, Any]) -> bool:
+    """Return whether a checkpoint holds its environments' states; without them new episodes begin."""
+    return all(part["env"] is not None for part in state.get("workers") or [state])
 
 
 _OF_LAYERS = ("hidden", "use_actions", "use_vail")

@@ -20,14 +20,17 @@ from mappo_unity.policies.league.growing import step_name
 from mappo_unity.policies.policy import CheckpointPolicy, Policy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
-from mappo_unity.training.collection.batches import Batch, BatchCollector
+from mappo_unity.training.collection.batches import Batch
+from mappo_unity.training.collection.fleet import Batches
 from mappo_unity.training.episode_stats import RecentEpisodes
 from mappo_unity.training.match_series import MatchSeries
 from mappo_unity.training.resume_check import (
     check_compatible,
     check_streams,
+    check_workers,
     describe_models,
     describe_policies,
+    has_snapshot,
 )
 from mappo_unity.training.self_play.self_play import SelfPlay
 from mappo_unity.training.setup import TrainingSetup
@@ -118,7 +121,7 @@ class RunState:
         times = {"steps_per_s": steps / seconds, "collect_s": collect_s, "update_s": update_s}
         return counters | episodes | self.recent_episodes.summary() | times | self.lessons.metrics()
 
-    def advance_lessons(self, batch: Batch, batches: BatchCollector) -> list[str]:
+    def advance_lessons(self, batch: Batch, batches: Batches) -> list[str]:
         """Go on to the next lessons where those in force are complete; return a line about each.
 
         What was said about recent episodes and the best policy does not hold for other lessons.
@@ -128,7 +131,7 @@ class RunState:
             return []
 
         for change in changes:
-            self.setup.env.set_parameter(change.name, change.lesson.value)
+            self.setup.fleet.set_parameter(change.name, change.lesson.value)
         if any(change.require_reset for change in changes):
             batches.restart()
             self.setup.forget_pending()
@@ -142,7 +145,7 @@ class RunState:
         if self.self_play is not None:
             self.self_play.begin(self._about())
 
-    def advance_self_play(self, batch: Batch, batches: BatchCollector) -> dict[str, float]:
+    def advance_self_play(self, batch: Batch, batches: Batches) -> dict[str, float]:
         """Count what opponents did in a batch, and choose those of the next ones; return metrics."""
         if self.self_play is None:
             return {}
@@ -197,8 +200,7 @@ class RunState:
         return self._about() | {
             "learners": copy.deepcopy(learners),
             "self_play": self_play,
-            "env": self.setup.env.get_state(),
-            "memories": {name: memory.clone() for name, memory in self.setup.policy.memories.items()},
+            **self.setup.fleet.state_dict(),
             "window": self.recent_episodes.state_dict(),
             "matches": self.matches.state_dict(),
             "rng": get_rng_state(),
@@ -222,13 +224,9 @@ class RunState:
 
         for name, learner in self.setup.learners.items():
             learner.load_state_dict(state["learners"][name])
-        # an environment that gives no snapshots begins new episodes
-        if state["env"] is not None:
-            # without its environment's state a run begins new episodes, and memories anew with them
-            memories = state.get("memories", {})
-            self.setup.policy.memories = {name: m.to(self.cfg.device) for name, m in memories.items()}
-            self._restore_env(path, checkpoint.to_arrays(state["env"]))
-        self._restore_lessons(state.get("lessons", {}), is_new=state["env"] is None)
+        check_workers(path, state, self.cfg.collect.workers)
+        self._restore_fleet(path, state)
+        self._restore_lessons(state.get("lessons", {}), is_new=not has_snapshot(state))
 
         self.recent_episodes.load_state_dict(state["window"])
         self.matches.load_state_dict(state["matches"], state["best_score"])
@@ -247,9 +245,9 @@ class RunState:
         if self._rng_state is not None:
             set_rng_state(self._rng_state)
 
-    def _restore_env(self, path: Path, state: dict[str, Any]) -> None:
+    def _restore_fleet(self, path: Path, state: dict[str, Any]) -> None:
         try:
-            self.setup.env.set_state(state)
+            self.setup.fleet.load_state_dict(state)
         except ConfigError as error:
             raise checkpoint.CheckpointError(
                 f"checkpoint {path} does not fit the environment's options, which cannot change with resume: "
@@ -264,9 +262,9 @@ class RunState:
             changed = {name: value for name, value in self.lessons.values.items() if value != first[name]}
 
         for name, value in changed.items():
-            self.setup.env.set_parameter(name, value)
+            self.setup.fleet.set_parameter(name, value)
         if is_new and changed:  # its first episodes began with the first lessons
-            self.setup.env.restart()
+            self.setup.fleet.restart()
 
     def _about(self) -> dict[str, Any]:
         """Return what a file needs beside networks to be played."""

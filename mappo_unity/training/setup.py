@@ -1,4 +1,4 @@
-"""What a training run is made of: the environment, the learners and the collector.
+"""What a training run is made of: what collects, and the learners.
 
 What an environment has (sensors, actions, teams) is read from it; what does not fit into memory is refused
 before the first step.
@@ -13,35 +13,32 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, ExplorationType
 
 from mappo_unity.config.per_behavior import TRAIN, is_frozen
-from mappo_unity.config.schema import CollectConfig, Config
-from mappo_unity.envs.backends import make_env_function
-from mappo_unity.envs.following import followed
-from mappo_unity.envs.replay import make_replay_function
-from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.config.schema import CollectConfig, Config, Engine
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.learning.networks.opponents import Opponents
-from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
-from mappo_unity.training.collection.batches import Batch, BatchCollector, count_decisions, count_present
+from mappo_unity.training.collection.batches import Batch, count_decisions
+from mappo_unity.training.collection.description import Played, describe
+from mappo_unity.training.collection.fleet import Batches, Fleet, SoleWorker
+from mappo_unity.training.collection.processes import WorkerProcesses
+from mappo_unity.training.collection.several_workers import LocalWorkers
 from mappo_unity.training.learners import make_learners
 from mappo_unity.training.lessons.curriculum import lessons_of
 
 
 class TrainingSetup:
-    """The environment, and a learner for every policy name.
+    """What collects, and a learner for every policy name.
 
     Args:
         cfg: the run's options.
-        env: the environment, open.
+        fleet: what collects; its environments are open.
 
-    Attributes: `learners` by policy name; `policy`, their actors as one; `lessons` of environment parameters;
+    Attributes: `env`, what is played: the environment, or with workers what is known of theirs; `learners`
+    by policy name; `policy`, their actors as one; `lessons` of environment parameters;
     `notes`, lines for the user; `frozen`, the policy names that only play; `opponents`, who plays some of the
     teams instead of the learners, with self-play; `guesses_channels`, whether `guess_channels` built the
     networks.
@@ -50,10 +47,11 @@ class TrainingSetup:
         ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
     """
 
-    def __init__(self, cfg: Config, env: UnityEnv) -> None:
-        self.cfg, self.env = cfg, env
+    def __init__(self, cfg: Config, fleet: Fleet) -> None:
+        self.cfg, self.fleet, self.env = cfg, fleet, fleet.env
         self.notes = [f"note: {cfg.env.note}"] if cfg.env.note is not None else []
-        self.lessons = lessons_of(cfg.env, env)
+        self.lessons = lessons_of(cfg.env, self.env)
+        fleet.lessons_in_force = self.lessons.in_force
         self.notes += self.lessons.notes
 
         self.opponents = Opponents() if cfg.self_play.is_on else None
@@ -81,16 +79,11 @@ class TrainingSetup:
             self.learners[name].actor.moving_norms = []
 
     @contextmanager
-    def collecting(self) -> Iterator[BatchCollector]:
-        """Yield endless batches, collected from where the environment stands."""
+    def collecting(self) -> Iterator[Batches]:
+        """Yield endless batches, collected from where the environments stand."""
         keeps_ends = any(learner.rewards.intrinsic for learner in self.learners.values())
-        env = followed(self.env, keeps_ends)
-        collector = make_collector(env, self.policy, device=self.cfg.device)
-        try:
-            yield BatchCollector(collector, self.env, self.cfg.collect, self.opponents)
-        finally:
-            # `set_up` opened the environment, and closes it
-            collector.shutdown(close_env=False)
+        self.fleet.start(self.policy, keeps_ends)
+        yield Batches(self.fleet, self.policy, self.cfg)
 
     def learn(self, batch: Batch, progress: float) -> dict[str, dict[str, float]]:
         """Improve every policy by a batch; return the metrics of each.
@@ -122,7 +115,7 @@ class TrainingSetup:
 
 @contextmanager
 def set_up(cfg: Config, folder: Path) -> Iterator[TrainingSetup]:
-    """Open the environment and build what learns; close the environment at the end of the block.
+    """Open the environments and build what learns; close the environments at the end of the block.
 
     Args:
         cfg: the run's options.
@@ -133,12 +126,20 @@ def set_up(cfg: Config, folder: Path) -> Iterator[TrainingSetup]:
     """
     prepare_torch(cfg)
     check_loggers(cfg.log)
-    env = make_unity_env(cfg, folder)
+    fleet = make_fleet(cfg, folder)
     try:
-        yield TrainingSetup(cfg, env)
+        yield TrainingSetup(cfg, fleet)
     finally:
-        if not env.is_closed:
-            env.close()
+        fleet.close()
+
+
+def make_fleet(cfg: Config, folder: Path) -> Fleet:
+    """Open the environments that the options ask for, in this process or in others."""
+    if not cfg.collect.workers:
+        return SoleWorker(cfg, folder)
+    if cfg.collect.engine is Engine.local:
+        return LocalWorkers(cfg, folder)
+    return WorkerProcesses(cfg, folder)
 
 
 def prepare_torch(cfg: Config) -> None:
@@ -160,40 +161,9 @@ def check_device(device: str) -> None:
         raise ConfigError(f"device={device}: the last CUDA device that torch finds is cuda:{count - 1}")
 
 
-def make_unity_env(cfg: Config, folder: Path) -> UnityEnv:
-    """Open the environment of the options behind the adapter; players log below the run's folder."""
-    make_env = make_replay_function(cfg) if cfg.bc.only else make_env_function(cfg.env, folder / PLAYERS)
-    return UnityEnv(
-        make_env,
-        cfg.seed,
-        action_limit=CONTINUOUS_LIMIT,
-        max_team_size=cfg.env.max_team_size,
-        max_teams=cfg.env.max_teams,
-        death_masking=cfg.ppo.death_masking,
-    )
-
-
-def batch_rounds(cfg: CollectConfig, env: UnityEnv) -> int:
+def batch_rounds(cfg: CollectConfig, env: Played) -> int:
     """Return the rounds of a batch in which all agents act that the environment began with."""
     if cfg.rounds is not None:
         return cfg.rounds
     # agents that are there, not slots: some of these may stay empty
-    return -(-cfg.batch_size // max(1, count_present(env)))
-
-
-def make_collector(env: EnvBase, policy: JointPolicy, rounds: int = 1, device: str = "cpu") -> Collector:
-    """Build a collector of endless stretches of so many rounds, on the networks' device."""
-    devices = {"policy_device": device, "env_device": "cpu", "storing_device": device}
-    return Collector(
-        env,
-        policy,
-        frames_per_batch=rounds,
-        total_frames=-1,
-        exploration_type=ExplorationType.RANDOM,
-        track_traj_ids=False,
-        use_buffers=False,  # a batch is a new stack of its rounds,
-        return_same_td=device == "cpu",  # so that nothing has to be copied out of it
-        trust_policy=True,
-        auto_register_policy_transforms=False,
-        **({} if device == "cpu" else devices),
-    )
+    return -(-cfg.batch_size // max(1, describe(env).present))

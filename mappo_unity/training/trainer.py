@@ -20,7 +20,7 @@ from mappo_unity.policies.export import RunExports
 from mappo_unity.policies.warm_start.start import warm_start
 from mappo_unity.runs.logger import RunLog
 from mappo_unity.signals import Interrupted
-from mappo_unity.training.collection.batches import BatchCollector
+from mappo_unity.training.collection.fleet import Batches
 from mappo_unity.training.episode_stats import by_policy
 from mappo_unity.training.memory import is_out_of_memory
 from mappo_unity.training.outcome import DIVERGED, FINISHED, INTERRUPTED, SOLVED, Outcome, why_over
@@ -92,7 +92,7 @@ def train(
 
 def _iterate(
     cfg: Config,
-    batches: BatchCollector,
+    batches: Batches,
     state: RunState,
     saver: CheckpointSaver,
     log: RunLog,

@@ -20,8 +20,8 @@ from mappo_unity.config.parameters.samplers import Sampler, Value
 from mappo_unity.config.parameters.values import curricula, show_parameter, values_at
 from mappo_unity.config.schema import EnvConfig
 from mappo_unity.envs.returns import Episode
-from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
+from mappo_unity.training.collection.description import Played
 
 KEPT = 0.25
 """Share of the smoothed return before in the new one (CompletionCriteriaSettings.need_increment)."""
@@ -77,6 +77,11 @@ class Lessons:
     def values(self) -> dict[str, Any]:
         """The values of all parameters that are in force."""
         return values_at(self._parameters, self.numbers)
+
+    def in_force(self) -> dict[str, Value]:
+        """Return the values of the parameters with a curriculum."""
+        values = self.values
+        return {name: values[name] for name in self.numbers}
 
     def metrics(self) -> dict[str, float]:
         """Return the numbers of the lessons in force as metrics."""
@@ -211,7 +216,7 @@ class Lessons:
                 )
 
 
-def lessons_of(cfg: EnvConfig, env: UnityEnv) -> Lessons:
+def lessons_of(cfg: EnvConfig, env: Played) -> Lessons:
     """Return the lessons of the options; raise ConfigError where the environment does not fit them."""
     sizes = {name: env.behaviors[sides[0]].slots.team_size for name, sides in env.sides.items()}
     lessons = Lessons(cfg.parameters, sizes)

@@ -1,0 +1,191 @@
+"""A worker in a process of its own: what runs there, and the messages that it takes and gives.
+
+A message is a pickled tuple. To the worker: a method of `Worker` and its arguments, or `COLLECT`, `SLAB`,
+`CLOSE`. From it: (`OK`, what the method returned), (`SPACE`, rounds, rows) where a batch has no room in the
+memory that it knows, or (`ERROR`, `Report`). Tensors of a batch travel in shared memory (`slab`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import pickle
+import signal
+import sys
+import threading
+import traceback
+from dataclasses import replace
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError, EnvironmentFailure
+from mappo_unity.learning.networks.joint_policy import JointPolicy
+from mappo_unity.runs.rng import seed_everything
+from mappo_unity.training.collection.batches import Batch
+from mappo_unity.training.collection.slab import Layout, open_bytes, rows_of, write
+from mappo_unity.training.collection.worker import Worker, make_worker, worker_config
+
+COLLECT, SLAB, CLOSE = "collect", "slab", "close"
+OK, SPACE, ERROR = "ok", "space", "error"
+
+ROUNDS, STOP = 0, 1
+"""Of a pulse, int64 ``[2]``: the rounds that the worker has played, and whether it is to stop."""
+PULSE_BYTES = 16
+
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+class Report(NamedTuple):
+    """An exception of a worker: one that ends the run as it is, or any other one with its traceback."""
+
+    error: ConfigError | EnvironmentFailure | None
+    text: str
+
+
+class _Stopped(Exception):
+    """The driver does not want the batch any more."""
+
+
+def main(cfg: Config, number: int, folder: Path, restarts: int, pulse: str, pipe: Connection) -> None:
+    """Run a worker until the driver closes it, or is gone.
+
+    Args:
+        cfg: the run's options.
+        number: of the worker.
+        folder: of the run.
+        restarts: how often the worker was replaced.
+        pulse: path of the shared bytes of its pulse.
+        pipe: to the driver.
+    """
+    _follow_parent()
+    # the driver's business; not SIG_IGN, which players would inherit
+    for signal_number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signal_number, lambda number, frame: None)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+    torch.set_num_threads(cfg.num_threads)
+    seed_everything(worker_config(cfg, number, restarts).seed)
+    serving = _Serving(number, open_bytes(pulse, PULSE_BYTES).view(torch.int64), pipe)
+    try:
+        serving.serve(lambda: make_worker(cfg, number, folder, restarts))
+    except (EOFError, OSError):
+        os._exit(1)  # the driver has gone
+
+
+class _Serving:
+    """Answer the driver's messages one by one."""
+
+    def __init__(self, number: int, pulse: Tensor, pipe: Connection) -> None:
+        self._number, self._pulse, self._pipe = number, pulse, pipe
+        self._slabs: dict[int, tuple[Layout, Tensor]] = {}  # by set, 0 or 1
+
+    def serve(self, make: Any) -> None:
+        """Open the worker that `make` makes, and serve it."""
+        try:
+            worker: Worker = make()
+        except BaseException as error:
+            self._send(ERROR, report(error))
+            return
+
+        try:
+            self._send(OK, worker.describe())
+            while True:
+                method, *arguments = pickle.loads(self._pipe.recv_bytes())
+                if method == CLOSE:
+                    return
+                try:
+                    self._send(OK, self._answer(worker, method, arguments))
+                except _Stopped:
+                    return
+                except (EOFError, BrokenPipeError, ConnectionResetError):
+                    raise
+                except BaseException as error:
+                    self._send(ERROR, report(error))
+        finally:
+            worker.close()
+
+    def _answer(self, worker: Worker, method: str, arguments: list[Any]) -> Any:
+        if method == COLLECT:
+            weights, want_state, which = arguments
+            message = worker.collect(pickle.loads(weights), want_state)
+            return self._shared(message.batch, which), message.state
+        if method == "take":
+            packed_policy, keeps_ends = arguments
+            policy: JointPolicy = pickle.loads(packed_policy)
+            policy.register_forward_pre_hook(self._beat)
+            return worker.take(policy, keeps_ends)
+        return getattr(worker, method)(*arguments)
+
+    def _shared(self, batch: Batch, which: int) -> tuple[Batch, int, int]:
+        """Write a batch's rounds into a set's memory; return the rest, how many rounds, and its capacity."""
+        rounds = batch.rounds
+        length = rounds.shape[0]
+        if which not in self._slabs or self._slabs[which][0].capacity < length:
+            self._send(SPACE, (length, rows_of(rounds)))
+            message = pickle.loads(self._pipe.recv_bytes())
+            if message[0] == CLOSE:
+                raise _Stopped
+            _, path, layout = message
+            self._slabs[which] = layout, open_bytes(path, layout.size)
+
+        layout, block = self._slabs[which]
+        write(rounds, layout, block, self._number)
+        return replace(batch, rounds=TensorDict({}, [length])), length, layout.capacity
+
+    def _beat(self, *arguments: Any) -> None:
+        """Say that a round is played; leave where nobody wants the batch any more."""
+        self._pulse[ROUNDS] += 1
+        if self._pulse[STOP]:
+            raise _Stopped
+
+    def _send(self, kind: str, content: Any) -> None:
+        self._pipe.send_bytes(pickle.dumps((kind, content)))
+
+
+def report(error: BaseException) -> Report:
+    """Return what a driver is told about an exception; one that a user is to see keeps type and text."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    if isinstance(error, (ConfigError, EnvironmentFailure)):
+        kind = type(error)
+        # anew: what it came from may hold anything, and its type's constructor may take more than a text
+        plain = kind(str(error)) if _takes_a_text(kind) else _base(error)(str(error))
+        plain.details = error.details
+        return Report(plain, text)
+    return Report(None, text + "\n" + "".join(traceback.format_exception(error)))
+
+
+def _takes_a_text(kind: type[BaseException]) -> bool:
+    # of this package: others might be missing where the message is read
+    return kind.__module__.startswith("mappo_unity.") and kind.__init__ in (
+        ValueError.__init__,
+        RuntimeError.__init__,
+    )
+
+
+def _base(error: ConfigError | EnvironmentFailure) -> type[ConfigError] | type[EnvironmentFailure]:
+    return ConfigError if isinstance(error, ConfigError) else EnvironmentFailure
+
+
+def _follow_parent() -> None:
+    """Do not outlive the driver, however it ends."""
+    parent: Any = parent_process()
+
+    # a thread cannot run while the environment's own code holds Python's lock: the kernel can
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if not parent.is_alive():
+            os._exit(1)
+
+    def follow() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()

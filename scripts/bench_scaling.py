@@ -1,0 +1,89 @@
+#!/usr/bin/env python3
+"""Measure training with workers: decisions a second for 0, 1 and 2 of them, with overlap and without.
+
+Every variant trains the scene's preset for some iterations; they take turns, so that the ratios hold on a
+machine that is shared. What is timed is the whole loop: collecting, learning, metrics, the state that a
+checkpoint would hold; not the start, nor the first iterations.
+
+    python scripts/bench_scaling.py [--repeats 5] [--iterations 6] [3DBall SoccerTwos]
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+from mappo_unity.config.compose import compose_config
+from mappo_unity.training.outcome import INTERRUPTED
+from mappo_unity.training.run_state import RunState
+from mappo_unity.training.trainer import train
+
+WARM_UP = 2  # iterations that are not timed
+VARIANTS = (
+    ("0", []),
+    ("1", ["collect.workers=1"]),
+    ("2", ["collect.workers=2"]),
+    ("1, overlap", ["collect.workers=1", "collect.overlap=true"]),
+    ("2, overlap", ["collect.workers=2", "collect.overlap=true"]),
+)
+QUIET = ["log.loggers=[]", "log.progress=false", "export_onnx=false"]
+ENDLESS = ["max_steps=1000000000", "checkpoint_interval=1000000000", "matches.interval=1000000000"]
+
+
+def main() -> None:
+    """Measure each scene's preset and print a table for it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="*", default=["3DBall", "SoccerTwos"])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--iterations", type=int, default=6, help="timed ones of each repeat")
+    parser.add_argument("--option", action="append", default=[], help="a further option of every run")
+    arguments = parser.parse_args()
+
+    print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores")
+    for scene in arguments.scenes:
+        rates: dict[str, list[float]] = {name: [] for name, _ in VARIANTS}
+        for _ in range(arguments.repeats):
+            for name, lines in VARIANTS:
+                options = [f"env={scene}", *QUIET, *ENDLESS, *arguments.option, *lines]
+                rates[name].append(measure(options, arguments.iterations))
+        print_table(scene, rates)
+    print(f"load average {os.getloadavg()[0]:.2f}")
+
+
+def measure(options: list[str], iterations: int) -> float:
+    """Return agent decisions a second of training with these options."""
+    marks: list[tuple[float, int]] = []
+
+    def note(state: RunState) -> str | None:
+        marks.append((time.perf_counter(), state.agent_steps))
+        return INTERRUPTED if len(marks) == WARM_UP + iterations else None
+
+    with tempfile.TemporaryDirectory() as folder:
+        train(compose_config(options).config, Path(folder), None, note, Console(file=io.StringIO()))
+    (begin, before), (end, after) = marks[WARM_UP - 1], marks[-1]
+    return (after - before) / (end - begin)
+
+
+def print_table(scene: str, rates: dict[str, list[float]]) -> None:
+    """Print medians, and ratios to the first variant of the same repeat."""
+    print(f"\n{scene}\n{'workers':12} {'decisions/s':>12}  ratio to 0 workers (least to most)")
+    first = next(iter(rates.values()))
+    for name, values in rates.items():
+        ratios = [value / base for value, base in zip(values, first)]
+        print(
+            f"{name:12} {statistics.median(values):12,.0f}  {statistics.median(ratios):.2f} "
+            f"({min(ratios):.2f} to {max(ratios):.2f})"
+        )
+
+
+if __name__ == "__main__":
+    main()
