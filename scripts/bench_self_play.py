@@ -21,7 +21,7 @@ from pathlib import Path
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
-from mappo_unity.training.collection.batches import BatchCollector
+from mappo_unity.training.collection.fleet import Batches
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.setup import set_up
 
@@ -67,7 +67,7 @@ def measure(scene: str, options: list[str], repeats: int) -> None:
 
 
 @contextmanager
-def running(cfg: Config) -> Iterator[tuple[RunState, BatchCollector]]:
+def running(cfg: Config) -> Iterator[tuple[RunState, Batches]]:
     """Open a run without logs or checkpoints."""
     with tempfile.TemporaryDirectory() as out, set_up(cfg, Path(out)) as setup:
         state = RunState(cfg, Path(out), setup)
@@ -76,7 +76,7 @@ def running(cfg: Config) -> Iterator[tuple[RunState, BatchCollector]]:
             yield state, batches
 
 
-def iterate(state: RunState, batches: BatchCollector) -> float:
+def iterate(state: RunState, batches: Batches) -> float:
     """Collect and learn once; return decisions learnt a second."""
     began, before = time.perf_counter(), state.agent_steps
     batch = next(batches)

@@ -133,6 +133,7 @@ def test_what_is_on_its_way_when_a_checkpoint_is_written_is_collected_again(
     resumed.close()
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_replaced(processes: TrainingSetup) -> None:
     fleet = fleet_of(processes)
     killed, other = fleet.processes[1].pid, fleet.processes[0].pid

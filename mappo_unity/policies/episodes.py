@@ -53,19 +53,7 @@ def play(
     env.reset()
     check_specs(env.behavior_specs)
     for _ in range(MAX_ENV_STEPS):
-        silent += 1
-        for name in env.behavior_specs:
-            if name not in checks:
-                checks[name] = RecordCheck(name, env.behavior_specs[name])
-            decision, terminal = checks[name](env.get_steps(name))
-            _forget_crashed(env, name, running, counts)
-            _end_episodes(name, terminal, running, counts)
-            actor = policy[name] if isinstance(policy, dict) else policy
-            _tell(actor, name, decision, terminal, running)
-            _go_on(name, decision, running, counts)
-            if len(decision):
-                silent = 0
-                env.set_actions(name, actor.act(name, decision, env.behavior_specs[name]))
+        silent = 0 if _act(env, policy, checks, running, counts) else silent + 1
 
         names = [only] if only else list(env.behavior_specs)
         counts.skips = False
@@ -76,8 +64,37 @@ def play(
             raise silence_error(silent)
         env.step()
 
+    raise _endless(env, episodes, counts)
+
+
+def _act(
+    env: BaseEnv,
+    policy: Policy | dict[str, Policy],
+    checks: dict[str, RecordCheck],
+    running: dict[tuple[str, int], list[float]],
+    counts: _Counts,
+) -> bool:
+    """Take in what the environment reports, and act; return whether anybody requested a decision."""
+    asked = False
+    for name in env.behavior_specs:
+        if name not in checks:
+            checks[name] = RecordCheck(name, env.behavior_specs[name])
+        decision, terminal = checks[name](env.get_steps(name))
+        _forget_crashed(env, name, running, counts)
+        _end_episodes(name, terminal, running, counts)
+
+        actor = policy[name] if isinstance(policy, dict) else policy
+        _tell(actor, name, decision, terminal, running)
+        _go_on(name, decision, running, counts)
+        if len(decision):
+            asked = True
+            env.set_actions(name, actor.act(name, decision, env.behavior_specs[name]))
+    return asked
+
+
+def _endless(env: BaseEnv, episodes: int, counts: _Counts) -> EnvironmentFailure:
     ended = {name: len(counts.ended.get(name, [])) for name in env.behavior_specs}
-    raise EnvironmentFailure(
+    return EnvironmentFailure(
         f"episodes={episodes}: so many did not end within {MAX_ENV_STEPS:,} environment steps, only {ended}; "
         "does anything end an agent's episode (EndEpisode, a time limit)?"
     )
