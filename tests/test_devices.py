@@ -40,6 +40,14 @@ RUNS = {
     "curious": ([*BALL, "rewards.curiosity.strength=0.1", "rewards.rnd.strength=0.1"], 96),
     "rollback": ([*BALL, "ppo.max_kl=1e-9"], 96),
     "SoccerTwos": (["env=SoccerTwos", "env.num_areas=1", "matches.interval=1"], 96),
+    "self-play": (
+        [
+            *("env=SoccerTwos", "env.num_areas=2", "model.memory=gru", "ppo.sequence_length=4"),
+            *("matches.interval=null", "self_play.save_steps=1", "self_play.swap_steps=0"),
+            *("self_play.play_against_latest_model_ratio=0", "self_play.fixed=[random]"),
+        ],
+        96,
+    ),
     "Hallway": (["env=Hallway", "env.num_areas=2", "ppo.sequence_length=4"], 48),
     "DungeonEscape": (ROOM, 72),
     "workers": ([*BALL, "collect.workers=2", "collect.engine=local"], 96),
