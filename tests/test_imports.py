@@ -36,7 +36,7 @@ def imports_of(path, known):
 def test_modules_import_only_upward():
     paths = {module_name(path): path for path in PACKAGE.rglob("*.py")}
     graph = {name: imports_of(path, set(paths)) - {name} for name, path in paths.items()}
-    assert "mappo_unity.learning.ppo" in graph["mappo_unity.training.setup"]
+    assert "mappo_unity.learning.ppo" in graph["mappo_unity.training.learners"]
     left = dict(graph)
     while left:
         free = [name for name, needs in left.items() if not needs & left.keys()]

@@ -382,7 +382,7 @@ def test_options_are_checked() -> None:
         Toy(weight=2.0)
     with pytest.raises(ConfigError, match="size=0.0 of scene Toy is out of range: it must be > 0"):
         Toy().set_parameter("size", 0.0)
-    with pytest.raises(ConfigError, match="size='big' of scene Toy must be a finite number"):
+    with pytest.raises(ConfigError, match="size=big of scene Toy must be a finite number"):
         Toy(size="big")
     with pytest.raises(ConfigError, match="num_areas=0 must be"):
         Toy(num_areas=0)
