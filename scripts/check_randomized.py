@@ -7,12 +7,13 @@ python scripts/check_randomized.py [--steps 40000] [--seeds 0 1 2] [--episodes 2
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from learn_scene import mappo_eval
 
 HERE = Path(sys.executable).parent
 BALLS = [
@@ -57,8 +58,7 @@ def evaluate(run: Path, mass: float, scale: float, episodes: int) -> float:
     """Return the mean return of a run's best policy with one ball, most likely actions."""
     lines = [f"run={run}", "deterministic=true", f"episodes={episodes}"]
     lines += [f"env.params.mass={mass}", f"env.params.scale={scale}"]
-    done = subprocess.run([HERE / "mappo-eval", *lines], check=True, capture_output=True, text=True)
-    return float(json.loads(done.stdout.splitlines()[-1])["mean_return"])
+    return float(mappo_eval(*lines)["mean_return"])
 
 
 if __name__ == "__main__":

@@ -12,12 +12,13 @@ what was earned until then) and the clone's, sampled, with its standard error.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from learn_scene import mappo_eval
 
 from mappo_unity.protocol.demos.reader import read_demo
 
@@ -65,9 +66,7 @@ def clone(scene: str, demo: Path, folder: Path, options: list[str]) -> None:
 
 def evaluate(folder: Path, episodes: int) -> tuple[float, float]:
     """Return the mean return of a run's best checkpoint, and its standard error."""
-    command = [HERE / "mappo-eval", f"run={folder}", f"episodes={episodes}"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    result = json.loads(done.stdout.splitlines()[-1])
+    result = mappo_eval(f"run={folder}", f"episodes={episodes}")
     return result["mean_return"], result["stderr"]
 
 

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 HERE = Path(sys.executable).parent
 
@@ -55,9 +56,7 @@ def train(scene: str, seed: int, folder: Path, options: list[str]) -> None:
 def evaluate(scene: str, seed: int, folder: Path, episodes: int) -> dict[str, object]:
     """Evaluate the newest checkpoint, as it explores; return a row of results."""
     newest = sorted((folder / "checkpoints").glob("step_*.pt"))[-1]
-    command = [HERE / "mappo-eval", f"run={newest}", f"episodes={episodes}"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    result = json.loads(done.stdout.splitlines()[-1])
+    result = mappo_eval(f"run={newest}", f"episodes={episodes}")
 
     with open(folder / "metrics.csv") as file:
         seconds = float(list(csv.DictReader(file))[-1]["wall_s"])
@@ -71,6 +70,13 @@ def evaluate(scene: str, seed: int, folder: Path, episodes: int) -> dict[str, ob
         "stderr": round(result["stderr"], 3),
         "episodes": result["episodes"],
     }
+
+
+def mappo_eval(*options: str) -> dict[str, Any]:
+    """Return what mappo-eval says, with these options."""
+    done = subprocess.run([HERE / "mappo-eval", *options], check=True, capture_output=True, text=True)
+    said: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return said
 
 
 def append(path: Path, row: dict[str, object]) -> None:

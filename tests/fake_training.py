@@ -42,7 +42,9 @@ def train(cfg: Config, folder: Path, resume_from: Path | None = None, *show: obj
         return _wait_for_signal(folder)
     if cfg.seed == 15:
         return Outcome("interrupted", 15, 1, 1.0, math.nan)
-    print(f"{current_job().mark}half way{' beside others' * current_job().is_beside_others}", flush=True)
+    beside = " beside others" * current_job().is_beside_others
+    # the end of the line goes with it: jobs share one output, and an unbuffered one writes each part at once
+    print(f"{current_job().mark}half way{beside}\n", end="", flush=True)
     return Outcome(agent_steps=cfg.max_steps, wall_s=0.5, return_mean=cfg.seed - 1000 * cfg.ppo.lr)
 
 

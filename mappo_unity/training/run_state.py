@@ -133,8 +133,7 @@ class RunState:
         for change in changes:
             self.setup.fleet.set_parameter(change.name, change.lesson.value)
         if any(change.require_reset for change in changes):
-            batches.restart()
-            self.setup.forget_pending()
+            self._reset_scenes(batches)
         self.recent_episodes.forget()
         self.best_score = -math.inf
         self.matches.forget()
@@ -151,9 +150,13 @@ class RunState:
             return {}
         metrics, is_reset = self.self_play.advance(batch, self.agent_steps, self._about())
         if is_reset:
-            batches.restart()
-            self.setup.forget_pending()
+            self._reset_scenes(batches)
         return metrics
+
+    def _reset_scenes(self, batches: Batches) -> None:
+        """Let the next batch begin with new episodes; what is pending has no outcome any more."""
+        batches.restart()
+        self.setup.forget_pending()
 
     def play_matches(self) -> dict[str, float]:
         """Play a series of matches where one is due, and return its figures."""
@@ -168,9 +171,8 @@ class RunState:
         rivals = self.self_play.rivals(self._layout()) if self.self_play is not None else {}
         best = self._folder / checkpoint.FOLDER / checkpoint.BEST
         if best.exists():
-            with torch.random.fork_rng(
-                devices=[]
-            ):  # what training draws does not feel the network that is built
+            # building a network draws weights, of which training is to feel nothing
+            with torch.random.fork_rng(devices=[]):
                 policy = CheckpointPolicy(best, deterministic=False)
             rivals.setdefault(step_name(policy.agent_steps), policy)
         return rivals

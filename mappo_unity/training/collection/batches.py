@@ -84,7 +84,7 @@ class BatchCollector:
         missing = self._cfg.batch_size
         while missing > 0:
             # not everybody is asked in every round: what is missing then is played in further parts
-            parts.append(self._play(-(-missing // max(1, count_present(self._env)))))
+            parts.append(self._play(-(-missing // max(1, self._count_learning()))))
             missing -= count_decisions(parts[-1], self._env.sides)
 
         return self._with_records(parts[0] if len(parts) == 1 else torch.cat(parts, 0))
@@ -96,11 +96,9 @@ class BatchCollector:
 
     def _count_learning(self) -> int:
         """Return how many agents are there now that the learners play."""
-        return (
-            count_present(self._env)
-            if self._opponents is None
-            else count_learning(self._env, self._opponents)
-        )
+        if self._opponents is None:
+            return count_present(self._env)
+        return count_learning(self._env, self._opponents)
 
     def _play(self, rounds: int) -> TensorDictBase:
         self._collector.frames_per_batch = self._collector.requested_frames_per_batch = rounds
