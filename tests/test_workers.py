@@ -367,7 +367,6 @@ def wait_for(condition: Any, within_s: float = 120.0) -> None:
         (["collect.workers=2", LOCAL, "collect.overlap=true"], "needs collect.workers=1 or more"),
         (["collect.workers=2", "recipe=mlagents"], "ppo.obs_norm_update=round"),
         (["collect.workers=2", "behaviors.3DBall.ppo.obs_norm_update=round"], "ppo.obs_norm_update=round"),
-        (["env=SoccerTwos", "collect.workers=2", "self_play.save_steps=100"], "does not go with self_play"),
         (["collect.workers=2", "env.backend=editor"], "there is one Editor"),
         (
             ["env=WallJump", "parameters=WallJump_curriculum", "collect.workers=2", "collect.overlap=true"],

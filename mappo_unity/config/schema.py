@@ -806,13 +806,15 @@ class Config:
                 "apart; give ppo.obs_norm_update=batch, or leave collect.workers out"
             )
 
-        if self.self_play.is_on:
-            raise ConfigError(
-                f"{what} does not go with self_play yet: opponents play in one process; leave one of the two "
-                "out"
-            )
         if self.bc.only:
             raise ConfigError(f"{what} does not go with bc.only=true, where nothing is played; leave it out")
+
+        change = self.self_play.team_change if self.self_play.is_on else None
+        if self.collect.overlap and change is not None:
+            raise ConfigError(
+                f"self_play.team_change={change} does not go with collect.overlap=true: the next batch would "
+                "begin before it is known that the other side learns; give collect.overlap=false"
+            )
 
         lessons = curricula(env.parameters)
         if self.collect.overlap and lessons:

@@ -7,7 +7,7 @@ a sole worker that shares all with the learner; others are in `several_workers` 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,20 @@ from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.description import Played
+from mappo_unity.training.collection.lineups import Lineup
 from mappo_unity.training.collection.worker import Weights, Worker, make_unity_env
 
 
 class Fleet(ABC):
     """Workers, driven together.
 
-    Attributes: `env`, what they play; `lessons_in_force`, returns the values of environment parameters that
-    have changed since the environments were opened, for a worker that is replaced.
+    Attributes: `env`, what they play; `parts`, what each of them plays; `lessons_in_force`, returns the
+    values of environment parameters that have changed since the environments were opened, for a worker that
+    is replaced.
     """
 
     env: Played
+    parts: Sequence[Played]
     lessons_in_force: Callable[[], Mapping[str, Value]] = staticmethod(dict)
 
     @abstractmethod
@@ -44,6 +47,15 @@ class Fleet(ABC):
 
         Its tensors hold until the batch after the next is requested.
         """
+
+    @abstractmethod
+    def oppose(self, lineup: Lineup) -> None:
+        """Let opponents play teams from the next request on."""
+
+    @property
+    def opposing(self) -> set[int]:
+        """The numbers of the opponents of a batch that is on its way."""
+        return set()
 
     @abstractmethod
     def set_parameter(self, name: str, value: Value) -> None:
@@ -71,7 +83,9 @@ class SoleWorker(Fleet):
 
     def __init__(self, cfg: Config, folder: Path) -> None:
         self.env = make_unity_env(cfg, folder / PLAYERS)
+        self.parts = [self.env]
         self._worker = Worker(cfg, self.env, cfg.device)
+        self._lineup: Lineup | None = None  # of the next request
 
     def start(self, policy: JointPolicy, keeps_ends: bool) -> None:
         """Hand out the policy."""
@@ -79,10 +93,17 @@ class SoleWorker(Fleet):
 
     def request(self, weights: Weights | None, want_state: bool) -> None:
         """Ask for a batch, which `receive` collects."""
+        if self._lineup is not None:
+            self._worker.oppose(self._lineup)
+            self._lineup = None
 
     def receive(self) -> Batch:
         """Collect a batch with the policy as it is."""
         return self._worker.collect(None, want_state=False).batch
+
+    def oppose(self, lineup: Lineup) -> None:
+        """Let opponents play."""
+        self._lineup = lineup
 
     def set_parameter(self, name: str, value: Value) -> None:
         """Set an environment parameter."""
