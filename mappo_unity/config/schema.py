@@ -797,15 +797,6 @@ class Config:
 
     def _check_workers(self) -> None:
         what, env = f"collect.workers={self.collect.workers}", self.env
-        own = [section.get("ppo") for section in self.behaviors.values() if isinstance(section, dict)]
-        moving = [ppo.get("obs_norm_update") for ppo in own if isinstance(ppo, dict)]
-
-        if self.ppo.obs_norm_update is ObsNormUpdate.round or "round" in moving:
-            raise ConfigError(
-                f"{what} does not go with ppo.obs_norm_update=round: the normalisers of workers would drift "
-                "apart; give ppo.obs_norm_update=batch, or leave collect.workers out"
-            )
-
         if self.bc.only:
             raise ConfigError(f"{what} does not go with bc.only=true, where nothing is played; leave it out")
 

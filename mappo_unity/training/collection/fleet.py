@@ -13,6 +13,8 @@ from typing import Any
 
 from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.config.schema import Config
+from mappo_unity.learning.networks.actor_critic import UnityActor
+from mappo_unity.learning.networks.encoders import update_norms
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.training.collection.batches import Batch
@@ -152,6 +154,8 @@ class Batches:
             self._request()
         batch = self._fleet.receive()
         self._is_requested = False
+        if not self._shares:
+            move_norms(self._policy, batch)
         if self._overlap:
             self._request()
         return batch
@@ -163,6 +167,17 @@ class Batches:
     def _request(self) -> None:
         self._fleet.request(None if self._shares else weights_of(self._policy), want_state=True)
         self._is_requested = True
+
+
+def move_norms(policy: JointPolicy, batch: Batch) -> None:
+    """Take a batch of workers into the statistics that move with each round (`ppo.obs_norm_update=round`).
+
+    Each worker has moved its own copies by its own rounds alone. All begin the next batch with these, which
+    have seen what they would have seen in one process.
+    """
+    for name, actor in zip(policy.names, policy.actors.values()):
+        if isinstance(actor, UnityActor):
+            update_norms(actor.moving_norms, batch.rounds.get(name))
 
 
 def weights_of(policy: JointPolicy) -> dict[str, dict[str, Any]]:
