@@ -112,6 +112,7 @@ class SelfPlay:
         if changed or agent_steps - self._drawn_at >= cfg.swap_steps:
             self._drawn_at = agent_steps
             self._draw()
+        self._pool.keep(self._used(), agent_steps)
         return metrics, changed
 
     def rivals(self, layout: dict[str, Any]) -> dict[str, Policy]:
