@@ -4,6 +4,7 @@ import os
 import signal
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from test_self_play import GAME, GAMES, matrix_game
@@ -16,7 +17,7 @@ from mappo_unity.config.schema import CollectConfig, Engine, OpponentDraw
 from mappo_unity.keys import LEARNER
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import seed_everything
-from mappo_unity.training.collection.lineups import Lineup, Lineups, split_players
+from mappo_unity.training.collection.lineups import Lineup, Lineups, players_of_pairs, split_players
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.self_play.draw import LATEST
 from mappo_unity.training.setup import set_up
@@ -191,11 +192,16 @@ def part(teams):
     return SimpleNamespace(behaviors=behaviors, sides={name.partition("?")[0]: [name] for name in teams})
 
 
-def test_workers_of_different_sizes_get_their_own_teams():
+def test_two_who_are_drawn_as_a_pair_meet_also_where_sides_have_different_numbers_of_teams():
     parts = [part({"A?team=0": 1, "B?team=1": 2}), part({"A?team=0": 2, "B?team=1": 1})]
-    first, second = split_players({"A": torch.tensor([1, 2, 3]), "B": torch.tensor([4, 5, 6])}, parts)
-    assert {name: own.tolist() for name, own in first.items()} == {"A": [1], "B": [4, 5]}
-    assert {name: own.tolist() for name, own in second.items()} == {"A": [2, 3], "B": [6]}
+    # pairs 0 and 1 are the first worker's, and nobody of A is in the second of them
+    drawn = {"A?team=0": np.array([10, 11, 12, 13]), "B?team=1": np.array([20, 21, 22, 23])}
+    players = players_of_pairs(drawn, parts)
+    assert {name: own.tolist() for name, own in players.items()} == {"A": [10, 12, 13], "B": [20, 21, 22]}
+
+    first, second = split_players(players, parts)
+    assert {name: own.tolist() for name, own in first.items()} == {"A": [10], "B": [20, 21]}
+    assert {name: own.tolist() for name, own in second.items()} == {"A": [12, 13], "B": [22]}
 
 
 def test_sides_take_turns_only_where_the_next_batch_waits_for_it(tmp_path, capsys):

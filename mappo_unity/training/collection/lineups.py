@@ -6,6 +6,8 @@ import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from mappo_unity.keys import LEARNER
@@ -92,15 +94,39 @@ def numbers_in(players: Iterable[Tensor]) -> set[int]:
     return {number for part in players for number in part.unique().tolist()} - {LEARNER}
 
 
+def count_pairs(part: Played) -> int:
+    """Return how many pairs of teams a worker has; of a side with fewer teams the last ones have none."""
+    return max(behavior.slots.num_teams for behavior in part.behaviors.values())
+
+
+def players_of_pairs(drawn: Mapping[str, np.ndarray], parts: Sequence[Played]) -> Players:
+    """Return who plays the teams of all workers, which stand side by side.
+
+    Args:
+        drawn: who plays in each pair, int64 ``[pairs]`` by behavior, one worker's behind another's.
+        parts: what each worker has.
+    """
+    pairs = [count_pairs(part) for part in parts]
+    players: Players = {}
+    for name, sides in parts[0].sides.items():
+        joint = torch.from_numpy(np.stack([drawn[side] for side in sides])).split(pairs, -1)
+        own = torch.cat([share[:, : _teams(part, name)] for share, part in zip(joint, parts)], -1)
+        players[name] = own if len(sides) > 1 else own[0]
+    return players
+
+
 def split_players(players: Players, parts: Sequence[Played]) -> tuple[Players, ...]:
-    """Return each worker's part of who plays the teams of all, which stand side by side."""
+    """Return each worker's part of what `players_of_pairs` returns."""
     shares = {
-        name: joint.cpu().split([part.behaviors[part.sides[name][0]].slots.num_teams for part in parts], -1)
-        for name, joint in players.items()
+        name: joint.cpu().split([_teams(part, name) for part in parts], -1) for name, joint in players.items()
     }
     return tuple(
         {name: share[number].clone() for name, share in shares.items()} for number in range(len(parts))
     )
+
+
+def _teams(part: Played, name: str) -> int:
+    return part.behaviors[part.sides[name][0]].slots.num_teams
 
 
 def line_up(

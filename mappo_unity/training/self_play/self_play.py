@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from mappo_unity import keys
 from mappo_unity.config.schema import Config
@@ -28,7 +27,9 @@ from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.lineups import (
     Lineup,
     Network,
+    count_pairs,
     make_player,
+    players_of_pairs,
     split_players,
 )
 from mappo_unity.training.episode_stats import by_policy
@@ -184,17 +185,12 @@ class SelfPlay:
         fleet, env = self._setup.fleet, self._setup.env
         rng = np.random.default_rng([self._seed, self._draws])
         self._draws += 1
-        pairs = [max(state.slots.num_teams for state in part.behaviors.values()) for part in fleet.parts]
         records = {behavior: self._records.get(keys.policy_name(behavior), {}) for behavior in env.behaviors}
-        teams = dict.fromkeys(env.behaviors, sum(pairs))
+        teams = dict.fromkeys(env.behaviors, sum(map(count_pairs, fleet.parts)))
         drawn = draw_teams(rng, self._cfg, self._sides, teams, records, self._learning)
 
-        for name, sides in env.sides.items():
-            plan = torch.from_numpy(np.stack([drawn[side] for side in sides])).to(self._device)
-            # of each worker's pairs of teams those that this name has
-            own = [part.behaviors[sides[0]].slots.num_teams for part in fleet.parts]
-            plan = torch.cat([part[:, :count] for part, count in zip(plan.split(pairs, -1), own)], -1)
-            self._opponents.plan(name, plan if len(sides) > 1 else plan[0])
+        for name, players in players_of_pairs(drawn, fleet.parts).items():
+            self._opponents.plan(name, players.to(self._device))
         self._line_up()
         self._pool.clean(self._used())
 
