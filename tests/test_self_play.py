@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -261,6 +262,20 @@ def test_a_run_with_a_pool_resumes_to_the_bit(tmp_path, changes):
     assert_same(without_times(first), without_times(second))
     files = [sorted(p.name for p in (tmp_path / run / "pool").iterdir()) for run in ("whole", "parts")]
     assert files[0] == files[1] and len(files[0]) <= 3 + 5 + 1  # the window, and what kept checkpoints name
+
+
+def test_a_run_that_dies_at_any_iteration_has_the_files_that_its_last_checkpoint_refers_to(tmp_path):
+    cfg = matrix_game(4, keep_checkpoints=1, checkpoint_interval=3 * 64)
+    cfg = replace(cfg, self_play=replace(cfg.self_play, window=1, play_against_latest_model_ratio=0.0))
+    run = tmp_path / "run"
+    train(cfg, run, after_iteration=lambda s: shutil.copytree(run, tmp_path / str(s.iteration)) and None)
+
+    for iteration in (2, 4):
+        died = tmp_path / str(iteration)
+        path, _ = checkpoint.newest_good(died)
+        train(cfg, died, path, after_iteration=lambda s: "interrupted")
+        assert int(rows(died)[-1]["agent_steps"]) > 0
+    assert len(list((run / "pool").iterdir())) <= 1 + 3 + 1  # the window, and what came since a checkpoint
 
 
 def test_two_scenes_with_two_sides_learn_with_a_pool(tmp_path):

@@ -36,7 +36,8 @@ SMALL = [
     *("ppo.minibatch_size=64", "ppo.epochs=1", "model.hidden=[8]", "log.loggers=[]", "log.progress=false"),
     *("export_onnx=false", "checkpoint_interval=1", "seed=5"),
 ]
-SOCCER = ["env=SoccerTwos", "env.num_areas=2", "collect.rounds=12", "collect.workers=2", *SMALL]
+ROUND = "ppo.obs_norm_update=round"
+SOCCER = ["env=SoccerTwos", "env.num_areas=2", "collect.rounds=12", "collect.workers=2", ROUND, *SMALL]
 LOCAL = "collect.engine=local"
 
 
@@ -244,17 +245,40 @@ def learnt(learner: Any, batch: Batch) -> list[tuple[float, ...]]:
     return sorted(tuple(round(value, 4) for value in row) for row in table.tolist())
 
 
+def test_statistics_that_move_with_each_round_have_seen_all_workers_when_a_batch_ends(tmp_path: Path) -> None:
+    lines = ["env=3DBall", "env.num_areas=4", "collect.rounds=16", "collect.workers=2", LOCAL, ROUND, *SMALL]
+    with set_up(options(*lines), tmp_path) as setup, setup.collecting() as batches:
+        (learner,) = setup.learners.values()
+        norm = learner.actor.moving_norms[0]
+        seen = []
+        for _ in range(3):
+            rounds = next(batches).rounds.get("3DBall")
+            seen.append(rounds.get(keys.OBS).flatten(0, -2).double())
+            rows = torch.cat(seen)
+            assert int(norm.count) == len(rows)
+            torch.testing.assert_close(norm.mean.double(), rows.mean(0), atol=1e-5, rtol=1e-5)
+            torch.testing.assert_close(norm.var.double(), rows.var(0, unbiased=False), atol=1e-5, rtol=1e-4)
+
+        # a worker has begun with what all had seen before, and moved by its own rounds
+        fleet: Any = setup.fleet
+        (own,) = fleet._workers[1]._policy.actors.values()
+        half = seen[2].view(16, 2, -1, seen[2].shape[-1])[:, 1].flatten(0, 1)
+        rows = torch.cat([*seen[:2], half])
+        assert int(own.moving_norms[0].count) == len(rows)
+        torch.testing.assert_close(own.moving_norms[0].mean.double(), rows.mean(0), atol=1e-5, rtol=1e-5)
+
+
 # --- training and resuming
 
 
 def test_a_resumed_run_with_workers_is_the_whole_one(tmp_path: Path) -> None:
-    check_resume(tmp_path, "env=DungeonEscape", "env.num_areas=2", "model.memory=gru", LOCAL)
+    check_resume(tmp_path, "env=DungeonEscape", "env.num_areas=2", "model.memory=gru", ROUND, LOCAL)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("overlap", ["true", "false"])
-def test_a_resumed_run_with_processes_is_the_whole_one(tmp_path: Path, overlap: str) -> None:
-    check_resume(tmp_path, "env=DungeonEscape", "env.num_areas=2", f"collect.overlap={overlap}")
+@pytest.mark.parametrize("lines", [["collect.overlap=true", ROUND], ["collect.overlap=false"]])
+def test_a_resumed_run_with_processes_is_the_whole_one(tmp_path: Path, lines: list[str]) -> None:
+    check_resume(tmp_path, "env=DungeonEscape", "env.num_areas=2", *lines)
 
 
 def check_resume(folder: Path, *lines: str) -> None:
@@ -365,9 +389,6 @@ def wait_for(condition: Any, within_s: float = 120.0) -> None:
         (["collect.workers=2", "collect.timeout_s=0"], "collect.timeout_s=0"),
         (["collect.overlap=true"], "needs collect.workers=1 or more with collect.engine=processes"),
         (["collect.workers=2", LOCAL, "collect.overlap=true"], "needs collect.workers=1 or more"),
-        (["collect.workers=2", "recipe=mlagents"], "ppo.obs_norm_update=round"),
-        (["collect.workers=2", "behaviors.3DBall.ppo.obs_norm_update=round"], "ppo.obs_norm_update=round"),
-        (["env=SoccerTwos", "collect.workers=2", "self_play.save_steps=100"], "does not go with self_play"),
         (["collect.workers=2", "env.backend=editor"], "there is one Editor"),
         (
             ["env=WallJump", "parameters=WallJump_curriculum", "collect.workers=2", "collect.overlap=true"],

@@ -797,22 +797,15 @@ class Config:
 
     def _check_workers(self) -> None:
         what, env = f"collect.workers={self.collect.workers}", self.env
-        own = [section.get("ppo") for section in self.behaviors.values() if isinstance(section, dict)]
-        moving = [ppo.get("obs_norm_update") for ppo in own if isinstance(ppo, dict)]
-
-        if self.ppo.obs_norm_update is ObsNormUpdate.round or "round" in moving:
-            raise ConfigError(
-                f"{what} does not go with ppo.obs_norm_update=round: the normalisers of workers would drift "
-                "apart; give ppo.obs_norm_update=batch, or leave collect.workers out"
-            )
-
-        if self.self_play.is_on:
-            raise ConfigError(
-                f"{what} does not go with self_play yet: opponents play in one process; leave one of the two "
-                "out"
-            )
         if self.bc.only:
             raise ConfigError(f"{what} does not go with bc.only=true, where nothing is played; leave it out")
+
+        change = self.self_play.team_change if self.self_play.is_on else None
+        if self.collect.overlap and change is not None:
+            raise ConfigError(
+                f"self_play.team_change={change} does not go with collect.overlap=true: the next batch would "
+                "begin before it is known that the other side learns; give collect.overlap=false"
+            )
 
         lessons = curricula(env.parameters)
         if self.collect.overlap and lessons:

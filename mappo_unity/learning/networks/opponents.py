@@ -26,29 +26,29 @@ class Opponents:
     where several sides share the name.
 
     Attributes: `actors`, by policy name and number; `playing`, int64 of each place, by policy name: a number,
-    or `keys.LEARNER`.
+    or `keys.LEARNER`; `following`, likewise, who plays a team from its next episode on.
     """
 
     def __init__(self) -> None:
         self.actors: dict[str, dict[int, Player]] = {}
         self.playing: dict[str, Tensor] = {}
-        self._following: dict[str, Tensor] = {}  # likewise, who plays a team from its next episode on
+        self.following: dict[str, Tensor] = {}
         self._memories: dict[str, dict[int, Tensor]] = {}  # states [..., A, M] before an opponent's decisions
         self._places: dict[str, list[tuple[int, Tensor]]] = {}  # flat places of each number that plays
 
     def plan(self, name: str, players: Tensor) -> None:
         """Say who plays each team of a policy name from the team's next episode on, int64 of each place."""
-        self._following[name] = players
+        self.following[name] = players
 
     def used(self, name: str) -> set[int]:
         """Return the numbers of the opponents of a policy name that play, or will at a next episode."""
-        known = [players[name] for players in (self.playing, self._following) if name in players]
+        known = [players[name] for players in (self.playing, self.following) if name in players]
         return {number for players in known for number in players.unique().tolist()} - {LEARNER}
 
     def replace(self, name: str, known: set[int]) -> None:
         """Let the learner play the teams of opponents of a policy name that are not among the known ones."""
         numbers = torch.tensor(sorted(known | {LEARNER}))
-        for players in (self.playing, self._following):
+        for players in (self.playing, self.following):
             if name in players:
                 is_known = torch.isin(players[name], numbers.to(players[name].device))
                 players[name] = torch.where(is_known, players[name], LEARNER)
@@ -77,8 +77,8 @@ class Opponents:
             self.playing[name] = torch.full(acting.shape[:-2], LEARNER, device=acting.device)
 
         begins = (first.any(-2) & ~(acting & ~first).any(-2)).squeeze(-1)
-        if name in self._following and bool(begins.any()):
-            self.playing[name] = torch.where(begins, self._following[name], self.playing[name])
+        if name in self.following and bool(begins.any()):
+            self.playing[name] = torch.where(begins, self.following[name], self.playing[name])
             self._places.pop(name, None)
 
         players = self.playing[name][..., None, None].expand(acting.shape)
@@ -156,13 +156,13 @@ class Opponents:
             name: {str(number): memory.clone() for number, memory in known.items()}
             for name, known in self._memories.items()
         }
-        return {"playing": dict(self.playing), "following": dict(self._following), "memories": memories}
+        return {"playing": dict(self.playing), "following": dict(self.following), "memories": memories}
 
     def load_state_dict(self, state: Mapping[str, Any], device: str) -> None:
         """Restore what `state_dict` returned."""
         self._places = {}
         self.playing = {name: players.to(device) for name, players in state["playing"].items()}
-        self._following = {name: players.to(device) for name, players in state["following"].items()}
+        self.following = {name: players.to(device) for name, players in state["following"].items()}
         self._memories = {
             name: {int(number): memory.to(device) for number, memory in known.items()}
             for name, known in state["memories"].items()
@@ -182,10 +182,11 @@ class RandomActor:
     Args:
         actor: whose place it takes; its actions have the same layout.
         limit: of continuous actions, as the environment's adapter takes them.
+        device: of the actions.
     """
 
-    def __init__(self, actor: UnityActor, limit: float) -> None:
-        self._layout, self._limit, self._device = actor.layout, limit, next(actor.parameters()).device
+    def __init__(self, actor: UnityActor, limit: float, device: str) -> None:
+        self._layout, self._limit, self._device = actor.layout, limit, device
         self.in_keys = [keys.MASK] if actor.layout.branches else []
 
     def choose(self, entries: TensorDictBase) -> Tensor:

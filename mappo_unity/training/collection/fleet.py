@@ -7,27 +7,32 @@ a sole worker that shares all with the learner; others are in `several_workers` 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.config.schema import Config
+from mappo_unity.learning.networks.actor_critic import UnityActor
+from mappo_unity.learning.networks.encoders import update_norms
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.description import Played
+from mappo_unity.training.collection.lineups import Lineup
 from mappo_unity.training.collection.worker import Weights, Worker, make_unity_env
 
 
 class Fleet(ABC):
     """Workers, driven together.
 
-    Attributes: `env`, what they play; `lessons_in_force`, returns the values of environment parameters that
-    have changed since the environments were opened, for a worker that is replaced.
+    Attributes: `env`, what they play; `parts`, what each of them plays; `lessons_in_force`, returns the
+    values of environment parameters that have changed since the environments were opened, for a worker that
+    is replaced.
     """
 
     env: Played
+    parts: Sequence[Played]
     lessons_in_force: Callable[[], Mapping[str, Value]] = staticmethod(dict)
 
     @abstractmethod
@@ -44,6 +49,15 @@ class Fleet(ABC):
 
         Its tensors hold until the batch after the next is requested.
         """
+
+    @abstractmethod
+    def oppose(self, lineup: Lineup) -> None:
+        """Let opponents play teams from the next request on."""
+
+    @property
+    def opposing(self) -> set[int]:
+        """The numbers of the opponents of a batch that is on its way."""
+        return set()
 
     @abstractmethod
     def set_parameter(self, name: str, value: Value) -> None:
@@ -71,7 +85,9 @@ class SoleWorker(Fleet):
 
     def __init__(self, cfg: Config, folder: Path) -> None:
         self.env = make_unity_env(cfg, folder / PLAYERS)
+        self.parts = [self.env]
         self._worker = Worker(cfg, self.env, cfg.device)
+        self._lineup: Lineup | None = None  # of the next request
 
     def start(self, policy: JointPolicy, keeps_ends: bool) -> None:
         """Hand out the policy."""
@@ -79,10 +95,17 @@ class SoleWorker(Fleet):
 
     def request(self, weights: Weights | None, want_state: bool) -> None:
         """Ask for a batch, which `receive` collects."""
+        if self._lineup is not None:
+            self._worker.oppose(self._lineup)
+            self._lineup = None
 
     def receive(self) -> Batch:
         """Collect a batch with the policy as it is."""
         return self._worker.collect(None, want_state=False).batch
+
+    def oppose(self, lineup: Lineup) -> None:
+        """Let opponents play."""
+        self._lineup = lineup
 
     def set_parameter(self, name: str, value: Value) -> None:
         """Set an environment parameter."""
@@ -131,6 +154,8 @@ class Batches:
             self._request()
         batch = self._fleet.receive()
         self._is_requested = False
+        if not self._shares:
+            move_norms(self._policy, batch)
         if self._overlap:
             self._request()
         return batch
@@ -142,6 +167,17 @@ class Batches:
     def _request(self) -> None:
         self._fleet.request(None if self._shares else weights_of(self._policy), want_state=True)
         self._is_requested = True
+
+
+def move_norms(policy: JointPolicy, batch: Batch) -> None:
+    """Take a batch of workers into the statistics that move with each round (`ppo.obs_norm_update=round`).
+
+    Each worker has moved its own copies by its own rounds alone. All begin the next batch with these, which
+    have seen what they would have seen in one process.
+    """
+    for name, actor in zip(policy.names, policy.actors.values()):
+        if isinstance(actor, UnityActor):
+            update_norms(actor.moving_norms, batch.rounds.get(name))
 
 
 def weights_of(policy: JointPolicy) -> dict[str, dict[str, Any]]:

@@ -51,6 +51,7 @@ def join_batches(
         sum(counted) if counted else None,
         sum(batch.dropped_episodes for batch in batches),
         sum(batch.dropped_steps for batch in batches),
+        [result for batch in batches for result in batch.results],
     )
 
 

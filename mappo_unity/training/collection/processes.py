@@ -210,6 +210,7 @@ class WorkerProcesses(SeveralWorkers):
             messages: list[tuple[Any, ...]] = [("set_parameter", *item) for item in values.items()]
             messages += [("restart",)] if values else []  # its first episodes began without them
             messages += [("take", *self._policy)] if self._policy is not None else []
+            messages += [("oppose", self._lineups.sent)] if self._lineups.sent is not None else []
             for message in messages:
                 process.send(*message)
                 process.receive()

@@ -15,11 +15,13 @@ from tensordict import TensorDictBase
 from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.config.schema import Config
 from mappo_unity.learning.networks.joint_policy import JointPolicy
+from mappo_unity.learning.networks.opponents import Opponents
 from mappo_unity.runs.rng import get_rng_state, seed_everything, set_rng_state
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.description import Description, join_descriptions
 from mappo_unity.training.collection.fleet import Fleet
 from mappo_unity.training.collection.joining import join_batches, on_device
+from mappo_unity.training.collection.lineups import Lineup, Lineups
 from mappo_unity.training.collection.worker import Message, Weights, Worker, make_worker, worker_config
 
 
@@ -40,15 +42,19 @@ class SeveralWorkers(Fleet):
     """
 
     def __init__(self, cfg: Config, parts: list[Description]) -> None:
-        self._cfg, self._parts = cfg, parts
+        self._cfg, self._parts, self.parts = cfg, parts, parts
         self.env: Description = join_descriptions(parts)
         self._weights: Weights | None = None  # of the batch that is requested, or was last
         self._is_requested = False
         self._states: list[dict[str, Any] | None] = [None] * len(parts)
         self._behind: Weights | None = None  # of a request that a checkpoint was written beside
+        self._lineups = Lineups()
 
     def request(self, weights: Weights | None, want_state: bool) -> None:
         """Ask every worker for a batch."""
+        lineup = self._lineups.next(self._behind is not None)
+        if lineup is not None:
+            self._call("oppose", lineup)
         if self._behind is not None:  # as in the run that is resumed
             weights, self._behind = self._behind, None
         self._weights, self._is_requested = weights, True
@@ -59,6 +65,15 @@ class SeveralWorkers(Fleet):
         batches, self._states, rounds = self._answers()
         self._is_requested = False
         return on_device(join_batches(batches, self._parts, rounds), self._cfg.device)
+
+    def oppose(self, lineup: Lineup) -> None:
+        """Let opponents play teams from the next request on."""
+        self._lineups.decide(lineup)
+
+    @property
+    def opposing(self) -> set[int]:
+        """The numbers of the opponents of a batch that is on its way, or is behind."""
+        return self._lineups.numbers if self._is_requested or self._behind is not None else set()
 
     def set_parameter(self, name: str, value: Value) -> None:
         """Set an environment parameter everywhere."""
@@ -74,8 +89,9 @@ class SeveralWorkers(Fleet):
         """Return the workers' states; `behind`: the weights of a batch on its way, to collect it again."""
         if None in self._states:
             self._states = self._call("state")
-        behind = self._weights if self._is_requested else None
-        return {"env": None, "memories": {}, "workers": self._states, "behind": behind}
+        behind, players = (self._weights, self._lineups.state_dict()) if self._is_requested else (None, None)
+        own = {"workers": self._states, "behind": behind, "behind_players": players}
+        return {"env": None, "memories": {}, **own}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore them."""
@@ -83,6 +99,7 @@ class SeveralWorkers(Fleet):
         self._states = [None] * len(self._parts)
         if self._cfg.collect.overlap:
             self._behind = state["behind"]
+            self._lineups.load_state_dict(state.get("behind_players"))
 
     @abstractmethod
     def _ask(self, weights: Weights | None, want_state: bool) -> None: ...
@@ -164,4 +181,7 @@ class LocalWorkers(SeveralWorkers):
 
 def packed(policy: JointPolicy) -> bytes:
     """Return a policy as bytes, whose copy lies on the CPU."""
-    return pickle.dumps(copy.deepcopy(policy).cpu())
+    own = copy.deepcopy(policy).cpu()
+    if own.opponents is not None:
+        own.opponents = Opponents()  # a worker is told its own
+    return pickle.dumps(own)

@@ -25,6 +25,7 @@ from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
 from mappo_unity.training.collection.batches import Batch, BatchCollector
 from mappo_unity.training.collection.description import Description, describe
+from mappo_unity.training.collection.lineups import Lineup, Network, line_up
 
 WORKER_STRIDE = 1_000_003
 """Worker n of several starts from the run's seed plus n times this (modulo 2^31)."""
@@ -47,15 +48,18 @@ class Worker:
         cfg: the worker's options, see `worker_config`.
         env: the environment, open.
         device: of the policy.
+        number: of the worker.
     """
 
-    def __init__(self, cfg: Config, env: UnityEnv, device: str = "cpu") -> None:
-        self.env, self._cfg, self._device = env, cfg, device
+    def __init__(self, cfg: Config, env: UnityEnv, device: str = "cpu", number: int = 0) -> None:
+        self.env, self._cfg, self._device, self._number = env, cfg, device, number
         self._policy: JointPolicy | None = None
         self._collector: Collector | None = None
         self._batches: BatchCollector | None = None
         self._memories: dict[str, Tensor] | None = None  # of a state that was loaded before the policy came
         self._rng: dict[str, Any] | None = None  # likewise
+        self._opponents: dict[str, Any] | None = None  # likewise, their state
+        self._networks: dict[int, dict[str, Network]] = {}  # of opponents, by number and policy name
 
     def describe(self) -> Description:
         """Return what the environment has; the driver opens none."""
@@ -71,6 +75,8 @@ class Worker:
         self._policy = policy
         if self._memories is not None:
             policy.memories = {name: memory.to(self._device) for name, memory in self._memories.items()}
+        if policy.opponents is not None and self._opponents is not None:
+            policy.opponents.load_state_dict(self._opponents, self._device)
 
         self._collector = make_collector(followed(self.env, keeps_ends), policy, device=self._device)
         self._batches = BatchCollector(self._collector, self.env, self._cfg.collect, policy.opponents)
@@ -92,6 +98,13 @@ class Worker:
         batch = next(self._batches)
         return Message(batch, self.state() if want_state else None)
 
+    def oppose(self, lineup: Lineup) -> None:
+        """Let opponents play teams from their next episodes on."""
+        assert self._policy is not None, "no policy to play with"
+        self._networks |= lineup.networks
+        line_up(self._policy, lineup.players[self._number], self._networks, self._device)
+        self._networks = {n: network for n, network in self._networks.items() if n in lineup.kept}
+
     def set_parameter(self, name: str, value: Value) -> None:
         """Set an environment parameter."""
         self.env.set_parameter(name, value)
@@ -106,9 +119,11 @@ class Worker:
     def state(self) -> dict[str, Any]:
         """Return what resuming needs, with the global generators of random numbers, which it draws from."""
         memories = self._policy.memories if self._policy is not None else self._memories or {}
+        opponents = self._policy.opponents if self._policy is not None else None
         return {
             "env": self.env.get_state(),
             "memories": {name: memory.clone() for name, memory in memories.items()},
+            "opponents": opponents.state_dict() if opponents is not None else self._opponents,
             "rng": get_rng_state(),
         }
 
@@ -122,7 +137,7 @@ class Worker:
         if state["env"] is not None:
             self._memories = dict(state["memories"])
             self.env.set_state(to_arrays(state["env"]))
-        self._rng = state.get("rng")
+        self._opponents, self._rng = state.get("opponents"), state.get("rng")
 
     def close(self) -> None:
         """Close the environment."""
@@ -181,7 +196,7 @@ def make_unity_env(cfg: Config, players: Path) -> UnityEnv:
 def make_worker(cfg: Config, number: int, folder: Path, restarts: int = 0) -> Worker:
     """Open the environment of one of several workers; see `worker_config`."""
     own = worker_config(cfg, number, restarts)
-    return Worker(own, make_unity_env(own, folder / PLAYERS / worker_folder(number)))
+    return Worker(own, make_unity_env(own, folder / PLAYERS / worker_folder(number)), number=number)
 
 
 def make_collector(env: EnvBase, policy: JointPolicy, rounds: int = 1, device: str = "cpu") -> Collector:

@@ -30,7 +30,7 @@ def load_fixed(
         where: the entry.
         specs: of the behaviors that it is to play, by full name; of two sides one is enough.
         actors: of the policy names, in whose places they play.
-        device: of the networks.
+        device: on which they play.
 
     Raises:
         ConfigError: nothing is there, or nothing that plays these behaviors.
@@ -38,7 +38,7 @@ def load_fixed(
     source = locate(where, OPTION)
     names = {keys.policy_name(behavior): behavior for behavior in specs}
     if source.kind is Kind.random:
-        return {name: RandomActor(actors[name], CONTINUOUS_LIMIT) for name in names}
+        return {name: RandomActor(actors[name], CONTINUOUS_LIMIT, device) for name in names}
 
     if source.kind in (Kind.onnx, Kind.onnx_folder):
         files = {name: _file_of(source.path, name, len(names)) for name in names}

@@ -53,7 +53,7 @@ class Snapshot:
     file: str
     checksum: int
     actors: dict[str, Tensors] = field(default_factory=dict)
-    dropped_at: int | None = None  # agent decisions when it left the pool
+    dropped_at: int | None = None  # out of the pool; agent decisions from which on no checkpoint refers to it
 
 
 class Pool:
@@ -110,6 +110,12 @@ class Pool:
         for old in self.numbers[: -self._window]:
             self._of(old).dropped_at = steps
         return number
+
+    def keep(self, used: set[int], steps: int) -> None:
+        """Keep the files of snapshots that left the pool and are still playing after so many decisions."""
+        for snapshot in self._snapshots:
+            if snapshot.dropped_at is not None and snapshot.number in used:
+                snapshot.dropped_at = steps + 1  # a checkpoint may be written now
 
     def clean(self, used: set[int]) -> None:
         """Delete the files of snapshots that neither play nor belong to a checkpoint that is kept.

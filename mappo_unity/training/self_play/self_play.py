@@ -7,13 +7,11 @@ what was to be expected (K = 1), and the opponent's by as much the other way.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from mappo_unity import keys
 from mappo_unity.config.schema import Config
@@ -26,6 +24,14 @@ from mappo_unity.policies.league.ratings import expected
 from mappo_unity.policies.policy import ActorPolicy, Policy
 from mappo_unity.policies.policy_files import RANDOM
 from mappo_unity.training.collection.batches import Batch
+from mappo_unity.training.collection.lineups import (
+    Lineup,
+    Network,
+    count_pairs,
+    make_player,
+    players_of_pairs,
+    split_players,
+)
 from mappo_unity.training.episode_stats import by_policy
 from mappo_unity.training.self_play.draw import LATEST, draw_teams
 from mappo_unity.training.self_play.fixed import OPTION, load_fixed
@@ -52,6 +58,7 @@ class SelfPlay:
     def __init__(self, cfg: Config, folder: Path, setup: TrainingSetup) -> None:
         self._cfg, self._setup = cfg.self_play, setup
         self._seed, self._device = cfg.seed, cfg.device
+        self._in_workers = cfg.collect.workers > 0  # who plays there is followed here
         self._sides = _two_sides(cfg, setup)
         self._names = [name for name in setup.learners if name not in setup.frozen]
         assert setup.opponents is not None
@@ -92,6 +99,9 @@ class SelfPlay:
         """
         metrics = self._count(batch)
         cfg = self._cfg
+        if self._in_workers:
+            for name in self._setup.learners:
+                self._opponents.playing[name] = batch.rounds.get((name, keys.PLAYER))[-1, ..., 0, 0].clone()
 
         if cfg.save_steps is not None and agent_steps - self._saved_at >= cfg.save_steps:
             self._save(agent_steps, about)
@@ -103,6 +113,7 @@ class SelfPlay:
         if changed or agent_steps - self._drawn_at >= cfg.swap_steps:
             self._drawn_at = agent_steps
             self._draw()
+        self._pool.keep(self._used(), agent_steps)
         return metrics, changed
 
     def rivals(self, layout: dict[str, Any]) -> dict[str, Policy]:
@@ -115,7 +126,11 @@ class SelfPlay:
         rivals = {where: open_policy(where, False, self._seed, OPTION) for where in named}
         for number in self._pool.numbers:
             name = step_name(self._pool.steps(number))
-            actors = {policy: self._make_actor(policy, number) for policy in self._setup.learners}
+            learners = self._setup.learners
+            actors = {
+                policy: make_player(learner.actor, self._network(policy, number))
+                for policy, learner in learners.items()
+            }
             rivals[name] = ActorPolicy(layout, actors, False, name)
         return rivals
 
@@ -167,45 +182,45 @@ class SelfPlay:
 
     def _draw(self) -> None:
         """Say who plays each team from its next episode on."""
-        env = self._setup.env
+        fleet, env = self._setup.fleet, self._setup.env
         rng = np.random.default_rng([self._seed, self._draws])
         self._draws += 1
-        teams = {behavior: state.slots.num_teams for behavior, state in env.behaviors.items()}
-        records = {behavior: self._records.get(keys.policy_name(behavior), {}) for behavior in teams}
-        players = draw_teams(rng, self._cfg, self._sides, teams, records, self._learning)
+        records = {behavior: self._records.get(keys.policy_name(behavior), {}) for behavior in env.behaviors}
+        teams = dict.fromkeys(env.behaviors, sum(map(count_pairs, fleet.parts)))
+        drawn = draw_teams(rng, self._cfg, self._sides, teams, records, self._learning)
 
-        used: set[int] = set()
-        for name, sides in env.sides.items():
-            plan = torch.from_numpy(np.stack([players[side] for side in sides])).to(self._device)
-            self._opponents.plan(name, plan if len(sides) > 1 else plan[0])
-            self._opponents.retire(name)
-            self._load_actors(name)
-            used |= self._opponents.used(name)
-        self._pool.clean(used)
+        for name, players in players_of_pairs(drawn, fleet.parts).items():
+            self._opponents.plan(name, players.to(self._device))
+        self._line_up()
+        self._pool.clean(self._used())
 
-    def _load_actors(self, name: str) -> None:
-        """Build the networks of the opponents of a policy name that play, or will."""
-        known = self._opponents.actors.setdefault(name, {})
-        for number in self._opponents.used(name) - known.keys():
-            known[number] = self._make_actor(name, number)
+    def _used(self) -> set[int]:
+        """Return the numbers of those who play, or will."""
+        own = {number for name in self._names for number in self._opponents.used(name)}
+        return own | self._setup.fleet.opposing
 
-    def _make_actor(self, name: str, number: int) -> Player:
-        learner = self._setup.learners[name].actor
+    def _line_up(self) -> None:
+        """Tell those who collect who plays."""
+        used, fleet = self._used(), self._setup.fleet
+        networks = {
+            number: {name: self._network(name, number) for name in self._names}
+            for number in used
+            if number in self._pool.all_numbers | {*self._fixed, LATEST}
+        }
+        kept = frozenset({*self._pool.numbers, *self._fixed, LATEST} | used)
+        fleet.oppose(Lineup(split_players(self._opponents.following, fleet.parts), networks, kept))
+
+    def _network(self, name: str, number: int) -> Network:
         if number == LATEST:
-            return learner
-        if number in self._fixed:
-            return self._fixed[number][name]
-
-        actor = copy.deepcopy(learner)
-        actor.keeps_components = False
-        actor.load_state_dict(self._pool.tensors(number, name))
-        return actor.eval()
+            return None
+        return self._fixed[number][name] if number in self._fixed else self._pool.tensors(number, name)
 
     def _load_fixed(self) -> dict[int, dict[str, Player]]:
         env, learners = self._setup.env, self._setup.learners
         specs = {sides[0]: env.behaviors[sides[0]].spec for n, sides in env.sides.items() if n in self._names}
         actors = {name: learner.actor for name, learner in learners.items()}
-        fixed = [load_fixed(where, specs, actors, self._device) for where in self._cfg.fixed]
+        device = "cpu" if self._in_workers else self._device
+        fixed = [load_fixed(where, specs, actors, device) for where in self._cfg.fixed]
         return {LATEST - 1 - index: players for index, players in enumerate(fixed)}
 
     # --- checkpoints
@@ -242,8 +257,7 @@ class SelfPlay:
                 f"{list(state['fixed'])}"
             )
         self._opponents.load_state_dict(state["opponents"], self._device)
-        used = {number for name in self._names for number in self._opponents.used(name)}
-        self._pool.load_state_dict(state["pool"], used, self._cfg.skip_missing, say)
+        self._pool.load_state_dict(state["pool"], self._used(), self._cfg.skip_missing, say)
         self._draws = int(state["draws"])
         self._saved_at, self._drawn_at, self._changed_at = (int(at) for at in state["at"])
         self.elo |= {name: float(elo) for name, elo in state["elo"].items() if name in self.elo}
@@ -255,7 +269,7 @@ class SelfPlay:
             rows = state["records"].get(name, [])
             self._records[name] = {int(n): Record(*values) for n, *values in rows if n in there}
             self._opponents.replace(name, self._pool.all_numbers | {*self._fixed, LATEST})
-            self._load_actors(name)
+        self._line_up()
 
 
 def _two_sides(cfg: Config, setup: TrainingSetup) -> dict[int, list[str]]:
