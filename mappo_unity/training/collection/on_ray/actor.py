@@ -77,7 +77,8 @@ class WorkerActor(Answering):
                 return OK, self._opened()
             assert self._worker is not None, "no worker"
             if method == CLOSE:
-                return OK, self._worker.close()
+                self._worker.close()
+                return OK, None
             return OK, self.answer(self._worker, method, arguments)
         except Stopped:
             return OK, None
