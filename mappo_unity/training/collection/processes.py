@@ -1,8 +1,8 @@
 """Workers in processes of their own, on this machine or on others; one that is lost is replaced.
 
-A worker is lost that is killed, raises what is ours, or hangs. The replacement has a fresh environment and the
-weights of the batch that is missing, and collects it again; what was pending of the lost one's agents teaches
-nothing.
+A worker is lost that is killed, raises what is ours, or hangs. The replacement has a fresh environment and
+the weights of the batch that is missing, and collects it again; what was pending of the lost one's agents
+teaches nothing.
 """
 
 from __future__ import annotations

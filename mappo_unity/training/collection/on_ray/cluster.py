@@ -72,7 +72,8 @@ class Cluster:
 def describe_room() -> str:
     """Return how many CPUs the cluster has."""
     total, free = (figures.get("CPU", 0) for figures in (ray.cluster_resources(), ray.available_resources()))
-    return f"the Ray cluster has {total:g} on {len(ray.nodes())} machines, {free:g} of them free"
+    machines = sum(node["Alive"] for node in ray.nodes())
+    return f"the Ray cluster has {total:g} on {machines} machine(s), {free:g} of them free"
 
 
 @contextmanager

@@ -73,9 +73,9 @@ class ActorHandle(WorkerHandle):
             message: tuple[str, Any] = ray.get(answer)
             return message
         except RayActorError as error:
-            raise WorkerLost(f"its actor ended: {_first_sentence(error)}") from None
+            raise WorkerLost(_reason(error)) from None
         except RayError as error:
-            raise WorkerLost(f"Ray says {type(error).__name__}: {_first_sentence(error)}") from None
+            raise WorkerLost(f"Ray says {type(error).__name__}: {_reason(error)}") from None
 
     def _wait_for_place(self, since: float) -> None:
         """Wait until the actor runs somewhere; raises ConfigError where the cluster has no room for it."""
@@ -90,7 +90,7 @@ class ActorHandle(WorkerHandle):
                 )
             if waited_s > PATIENCE_S and not is_said:
                 logger.warning(
-                    "worker %d has not begun; it takes %d CPU, and %s",
+                    "worker %d has not begun: it takes %d CPU, and %s",
                     self._number,
                     WORKER_CPUS,
                     describe_room(),
@@ -120,5 +120,8 @@ class ActorHandle(WorkerHandle):
             ray.kill(self._actor, no_restart=True)
 
 
-def _first_sentence(error: Exception) -> str:
-    return str(error).partition("\n")[0].strip().rstrip(".")
+def _reason(error: Exception) -> str:
+    """Return the sentence that says why, of the many that Ray has."""
+    lines = str(error).splitlines() or [type(error).__name__]
+    because = [line for line in lines if line.startswith("The actor is dead because")]
+    return (because or lines)[0].partition(". ")[0].strip().rstrip(".").replace("The actor", "the actor", 1)
