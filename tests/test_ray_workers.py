@@ -1,11 +1,9 @@
-"""Workers as actors of Ray: the same batches as elsewhere; lost, replaced, resumed; clusters found and left."""
+"""Workers as actors of Ray: the same batches as elsewhere; lost and replaced; a cluster without room."""
 
 from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,10 +12,8 @@ import pytest
 import torch
 from test_workers import (
     LOCAL,
-    SMALL,
     SOCCER,
     assert_same_batch,
-    check_resume,
     options,
     wait_for,
 )
@@ -106,8 +102,8 @@ def test_a_cluster_without_room_ends_in_a_message(actors: TrainingSetup, tmp_pat
         third.receive()
     third.end()
     assert str(error.value) == (
-        "collect.engine=ray: no place for worker 2 within collect.timeout_s=0.5 s: a worker takes 1 CPU, and the "
-        "Ray cluster has 2 on 1 machine(s), 0 of them free; lower collect.workers, or add machines"
+        "collect.engine=ray: no place for worker 2 within collect.timeout_s=0.5 s: a worker takes 1 CPU, and "
+        "the Ray cluster has 2 on 1 machine(s), 0 of them free; lower collect.workers, or add machines"
     )
 
 
@@ -152,6 +148,6 @@ def test_too_many_losses_end_the_run(actors: TrainingSetup, monkeypatch: pytest.
     with pytest.raises(EnvironmentFailure) as error:
         fleet.receive()
     assert str(error.value) == (
-        "worker 0 failed: the actor is dead because its worker process has died. It was replaced 0 times, and "
-        "env.max_restarts=0 allows no more"
+        "worker 0 failed: the actor is dead because its worker process has died. It was replaced 0 times, "
+        "and env.max_restarts=0 allows no more"
     )
