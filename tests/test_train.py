@@ -193,7 +193,9 @@ def wait_for_rows(folder, count, process):
     raise AssertionError("the run wrote no metrics")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGUSR1, 138), (signal.SIGTERM, 143)]
+)
 def test_signals_end_with_a_checkpoint_a_line_and_their_exit_code(tmp_path, number, code):
     process = start(tmp_path, *TINY, "max_steps=100000000", "checkpoint_interval=100000000")
     run = wait_for_rows(tmp_path, 3, process)
