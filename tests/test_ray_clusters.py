@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_workers import SMALL, SOCCER, check_resume, children, wait_for
+from test_workers import LOCAL, SMALL, SOCCER, check_resume, children, wait_for
 
 from mappo_unity.cli import train_main
 from mappo_unity.runs.metrics_csv import read_metrics
@@ -40,14 +40,18 @@ def test_a_resumed_run_with_ray_is_the_whole_one(tmp_path: Path, overlap: str) -
 
 def test_what_an_environment_raises_keeps_its_text_and_exit_code(tmp_path: Path, capsys: Any) -> None:
     cases = [
-        (3, "the game broke", ["env.factory=failing_env:make", "+env.params.at=12"]),
-        (2, "no licence", ["env.factory=test_workers:has_no_licence"]),
+        (3, ["env.factory=failing_env:make", "+env.params.at=12"]),
+        (2, ["env.factory=failing_env:make", "+env.params.at=12", "+env.params.how=sends_nan"]),
+        (2, ["env.factory=test_workers:has_no_licence"]),
     ]
-    for code, text, case in cases:
-        lines = ["env=custom", "env.name=Mine", *case, "collect.rounds=8", *SMALL, "collect.workers=2", RAY]
-        assert train_main([*lines, WITHOUT_END, f"hydra.run.dir={tmp_path / str(code)}"]) == code
-        said = capsys.readouterr().err
-        assert text in said and ("Traceback" in said) == (code == 3)
+    said = []
+    for engine in (RAY, LOCAL):
+        for code, case in cases:
+            lines = ["env=custom", "env.name=Mine", *case, "collect.rounds=8", *SMALL, "collect.workers=2"]
+            run = tmp_path / str(len(said))
+            assert train_main([*lines, engine, WITHOUT_END, f"hydra.run.dir={run}"]) == code
+            said.append(capsys.readouterr().err)
+    assert said[:3] == said[3:]
 
 
 def test_an_address_where_no_cluster_answers_is_refused(

@@ -1,4 +1,4 @@
-"""Sweeps whose jobs submitit starts: on this machine here, in SLURM elsewhere; a job that is started again."""
+"""Sweeps whose jobs submitit starts: on this machine here, in SLURM elsewhere; one that is started again."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ import ray
 from mappo_unity.errors import ConfigError
 
 ADDRESS = "RAY_ADDRESS"
+CONNECT_S = 10.0
 WORKER_CPUS = 1
 """CPUs that a worker asks for."""
 
@@ -43,6 +45,7 @@ class Cluster:
                 f"{ADDRESS}={address} is a Ray client's address; run on a machine of the cluster, with "
                 f"{ADDRESS}=auto, or give the address of its head node: {ADDRESS}=HOST:6379"
             )
+        _check_answers(address)
         own: dict[str, Any] = {"num_cpus": workers * WORKER_CPUS, "include_dashboard": False}
         with _handlers_kept():
             try:
@@ -55,11 +58,7 @@ class Cluster:
             except (ConnectionError, OSError, RuntimeError, ValueError) as error:
                 if address == "local":
                     raise
-                reason = " ".join(str(error).split()) or type(error).__name__
-                raise ConfigError(
-                    f"{ADDRESS}={address}: no Ray cluster answers there ({reason}); start one with "
-                    f"`ray start --head`, or unset {ADDRESS} for one of this run's own"
-                ) from error
+                raise _no_cluster(address, error) from error
 
     def leave(self) -> None:
         """End the connection, and a cluster that was started for it."""
@@ -74,6 +73,25 @@ def describe_room() -> str:
     total, free = (figures.get("CPU", 0) for figures in (ray.cluster_resources(), ray.available_resources()))
     machines = sum(node["Alive"] for node in ray.nodes())
     return f"the Ray cluster has {total:g} on {machines} machine(s), {free:g} of them free"
+
+
+def _check_answers(address: str) -> None:
+    """Raise ConfigError where nobody listens at ``host:port``: Ray would try for minutes."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise _no_cluster(address, error) from error
+
+
+def _no_cluster(address: str, error: Exception) -> ConfigError:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return ConfigError(
+        f"{ADDRESS}={address}: no Ray cluster answers there ({reason}); start one with `ray start --head`, "
+        f"or unset {ADDRESS} for one of this run's own"
+    )
 
 
 @contextmanager
