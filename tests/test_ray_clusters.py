@@ -160,7 +160,7 @@ def test_two_machines_and_a_kill_of_both_workers(
     assert train_main([*SOCCER, RAY, "max_steps=192", f"hydra.run.dir={tmp_path}"]) == 0
     assert len({*nodes[:2]}) == 2 and nodes[2] == "killed"
     rows = read_metrics(tmp_path / "metrics.csv")
-    assert [(row["agent_steps"], row["restarts"]) for row in rows] == [("96", "2"), ("192", "2")]
+    assert [(row["agent_steps"], row["restarts"]) for row in rows] == [(96, 2), (192, 2)]
     assert not ray.is_initialized()
     assert len(two_machines.list_all_nodes()) == 2  # the cluster stays
 

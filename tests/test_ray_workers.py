@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from mappo_unity.training.collection.several_workers import LocalWorkers
 from mappo_unity.training.setup import TrainingSetup, set_up
 
 RAY = "collect.engine=ray"
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Ray runs elsewhere")
 
 
 def test_without_the_package_the_extra_is_named(

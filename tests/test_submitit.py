@@ -18,6 +18,8 @@ from mappo_unity.runs.metrics_csv import read_metrics
 
 LOCAL = "hydra/launcher=submitit_local"
 
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="submitit runs elsewhere")
+
 
 @pytest.fixture(autouse=True)
 def _here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
