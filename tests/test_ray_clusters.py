@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_workers import LOCAL, SMALL, SOCCER, check_resume, children, wait_for
+from test_workers import LOCAL, SMALL, check_resume, children, wait_for
+from test_workers import SOCCER as TWO_AREAS
 
 from mappo_unity.cli import train_main
 from mappo_unity.runs.metrics_csv import read_metrics
@@ -20,6 +21,7 @@ from mappo_unity.training.collection.batches import Batch
 
 RAY = "collect.engine=ray"
 WITHOUT_END = "max_steps=100000000"
+SOCCER = [*TWO_AREAS, "matches.interval=null"]
 
 pytestmark = pytest.mark.slow
 
@@ -69,7 +71,7 @@ def test_an_address_where_no_cluster_answers_is_refused(
 
 def start(folder: Path, *lines: str) -> subprocess.Popen[bytes]:
     """Start a run of SoccerTwos in a process of its own."""
-    code = f"from mappo_unity.cli import train_main\ntrain_main({[*SOCCER, RAY, *lines]!r})\n"
+    code = f"import sys\nfrom mappo_unity.cli import train_main\nsys.exit(train_main({[*SOCCER, RAY, *lines]!r}))\n"
     return subprocess.Popen([sys.executable, "-c", code], cwd=folder, stdout=subprocess.DEVNULL)
 
 
@@ -92,7 +94,7 @@ def test_a_signal_ends_a_run_with_a_checkpoint(tmp_path: Path, number: int) -> N
     wait_for(lambda: (tmp_path / "run" / "checkpoints").is_dir())
     started = descendants(driver.pid)
     driver.send_signal(number)
-    driver.wait(60)
+    assert driver.wait(60) == 128 + number
     assert not any(is_alive(pid) for pid in started)
 
 
