@@ -71,8 +71,9 @@ def test_an_address_where_no_cluster_answers_is_refused(
 
 def start(folder: Path, *lines: str) -> subprocess.Popen[bytes]:
     """Start a run of SoccerTwos in a process of its own."""
-    code = f"import sys\nfrom mappo_unity.cli import train_main\nsys.exit(train_main({[*SOCCER, RAY, *lines]!r}))\n"
-    return subprocess.Popen([sys.executable, "-c", code], cwd=folder, stdout=subprocess.DEVNULL)
+    code = "import sys; from mappo_unity.cli import train_main; sys.exit(train_main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, *SOCCER, RAY, *lines]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL)
 
 
 def test_a_driver_that_is_killed_leaves_no_process(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -44,10 +45,11 @@ class ActorHandle(WorkerHandle):
         options |= {"concurrency_groups": {_PULSE: 1}, "scheduling_strategy": "SPREAD"}
         actor: Any = ray.remote(**options)(WorkerActor)
         self._actor = actor.remote(cfg, number, folder.absolute(), restarts, Place.here())
-        self._look: Any = self._actor.pulse.options(concurrency_group=_PULSE).remote()
+        self._look = self._asked_for_pulse()
         self._pid: int | None = None
         self._rounds = 0
-        self._answers: deque[Any] = deque()  # those that are awaited
+        # those that are awaited; futures, since a signal in the middle of `ray.get` loses its number
+        self._answers: deque[Future[Any]] = deque()
         self.send(OPEN)
 
     @property
@@ -57,7 +59,7 @@ class ActorHandle(WorkerHandle):
 
     def send(self, *message: Any) -> None:
         """Send a message; `receive` notices where nobody takes it."""
-        self._answers.append(self._actor.tell.remote(*message))
+        self._answers.append(self._actor.tell.remote(*message).future())
 
     def _message(self) -> tuple[str, Any]:
         answer = self._answers.popleft()
@@ -65,12 +67,12 @@ class ActorHandle(WorkerHandle):
         try:
             if self._pid is None:
                 self._wait_for_place(since)
-            while not ray.wait([answer], timeout=min(LOOK_S, self.timeout_s))[0]:
+            while not _is_done(answer, min(LOOK_S, self.timeout_s)):
                 if self._has_played():
                     since = time.monotonic()
                 elif time.monotonic() - since > self.timeout_s:
                     raise self._silent()
-            message: tuple[str, Any] = ray.get(answer)
+            message: tuple[str, Any] = answer.result()
             return message
         except RayActorError as error:
             raise WorkerLost(_reason(error)) from None
@@ -96,16 +98,20 @@ class ActorHandle(WorkerHandle):
                     describe_room(),
                 )
                 is_said = True
-            ray.wait([self._look], timeout=min(LOOK_S, self.timeout_s))
+            _is_done(self._look, min(LOOK_S, self.timeout_s))
 
     def _has_played(self) -> bool:
         """Return whether rounds were played, or the process began, since this was asked last."""
-        if not ray.wait([self._look], timeout=0)[0]:
+        if not self._look.done():
             return False
         before = self._pid, self._rounds
-        self._pid, self._rounds = ray.get(self._look)
-        self._look = self._actor.pulse.options(concurrency_group=_PULSE).remote()
+        self._pid, self._rounds = self._look.result()
+        self._look = self._asked_for_pulse()
         return before != (self._pid, self._rounds)
+
+    def _asked_for_pulse(self) -> Future[Any]:
+        future: Future[Any] = self._actor.pulse.options(concurrency_group=_PULSE).remote().future()
+        return future
 
     def stop(self) -> None:
         """Ask it to close its environment, also in the middle of a batch."""
@@ -116,8 +122,12 @@ class ActorHandle(WorkerHandle):
         """End the actor, at once after some seconds; its players go with it."""
         with suppress(RayError):
             if within_s > 0 and self._answers and self._pid is not None:
-                ray.wait([self._answers[-1]], timeout=within_s)
+                _is_done(self._answers[-1], within_s)
             ray.kill(self._actor, no_restart=True)
+
+
+def _is_done(answer: Future[Any], within_s: float) -> bool:
+    return bool(wait([answer], within_s).done)
 
 
 def _reason(error: Exception) -> str:
