@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: who takes them during a block, and how they become exceptions.
+"""SIGINT, SIGTERM and those of schedulers: who takes them during a block, how they become exceptions.
 
 Extension modules (NumPy, torch, MuJoCo) lose an interrupt that arrives while they are loaded, or are left
 half loaded: during imports it waits, or ends the process at once. How a training run and a sweep end is in
@@ -18,6 +18,17 @@ from typing import Any
 
 DUPLICATE_SIGNAL_S = 0.5
 """The same signal, once to the process and once to its group, is one; a second one comes later."""
+
+
+def scheduler_signals() -> tuple[int, ...]:
+    """Return the signals by which a scheduler asks a job to save its work: its time is over.
+
+    SIGUSR1; and SIGUSR2 where somebody takes it, as submitit does in its jobs.
+    """
+    if sys.platform == "win32":
+        return ()
+    is_taken = callable(signal.getsignal(signal.SIGUSR2))
+    return (signal.SIGUSR1, signal.SIGUSR2) if is_taken else (signal.SIGUSR1,)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ Every variant trains the scene's preset for some iterations; they take turns, so
 machine that is shared. What is timed is the whole loop: collecting, learning, metrics, the state that a
 checkpoint would hold; not the start, nor the first iterations.
 
-    python scripts/bench_scaling.py [--repeats 5] [--iterations 6] [3DBall SoccerTwos]
+    python scripts/bench_scaling.py [--repeats 5] [--iterations 6] [--engine ray] [3DBall SoccerTwos]
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=["3DBall", "SoccerTwos"])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--iterations", type=int, default=6, help="timed ones of each repeat")
+    parser.add_argument("--engine", choices=["processes", "ray"], default="processes", help="of workers")
     parser.add_argument("--option", action="append", default=[], help="a further option of every run")
     arguments = parser.parse_args()
 
@@ -54,6 +55,7 @@ def main() -> None:
         for _ in range(arguments.repeats):
             for name, lines in VARIANTS:
                 options = [f"env={scene}", *QUIET, *ENDLESS, *arguments.option, *lines]
+                options += [f"collect.engine={arguments.engine}"] if lines else []
                 rates[name].append(measure(options, arguments.iterations))
         print_table(scene, rates)
     print(f"load average {os.getloadavg()[0]:.2f}")

@@ -263,12 +263,13 @@ def test_a_missing_sweep_package_names_the_extra(monkeypatch: pytest.MonkeyPatch
     from mappo_unity.config import overrides
 
     monkeypatch.setattr(overrides, "is_installed", lambda module: False)
-    for line, package in (
-        ("hydra/launcher=joblib", "hydra-joblib-launcher"),
-        ("hydra/sweeper=optuna", "hydra-optuna-sweeper"),
+    for line, package, extra in (
+        ("hydra/launcher=joblib", "hydra-joblib-launcher", "sweep"),
+        ("hydra/launcher=submitit_slurm", "hydra-submitit-launcher", "slurm"),
+        ("hydra/sweeper=optuna", "hydra-optuna-sweeper", "sweep"),
     ):
         message = message_of([line])
-        assert package in message and install_command("sweep") in message
+        assert package in message and install_command(extra) in message
 
 
 def test_a_run_goes_on_with_its_own_options(tmp_path: Path) -> None:

@@ -193,14 +193,15 @@ def wait_for_rows(folder, count, process):
     raise AssertionError("the run wrote no metrics")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_signals_end_with_a_checkpoint_a_line_and_their_exit_code(tmp_path, number, code):
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGUSR1"])
+def test_signals_end_with_a_checkpoint_a_line_and_their_exit_code(tmp_path, name):
+    number = getattr(signal, name)
     process = start(tmp_path, *TINY, "max_steps=100000000", "checkpoint_interval=100000000")
     run = wait_for_rows(tmp_path, 3, process)
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == code
-    assert f"ended by {number.name}" in errors and f"resume={run.relative_to(tmp_path)}" in errors
+    assert process.returncode == 128 + number
+    assert f"ended by {name}" in errors and f"resume={run.relative_to(tmp_path)}" in errors
     assert "Traceback" not in errors
     last = checkpoint.checkpoints_in(run)[-1]
     assert checkpoint.load(last)["iteration"] == len(rows(run))

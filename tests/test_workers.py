@@ -26,8 +26,8 @@ from mappo_unity.runs import checkpoint
 from mappo_unity.scenes.contract.rules import EnvironmentDataError
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.fleet import weights_of
-from mappo_unity.training.collection.processes import WorkerProcesses
 from mappo_unity.training.collection.several_workers import LocalWorkers
+from mappo_unity.training.collection.shared_memory import WorkerProcesses
 from mappo_unity.training.collection.worker import Worker
 from mappo_unity.training.collection.worker_process import report
 from mappo_unity.training.setup import TrainingSetup, set_up

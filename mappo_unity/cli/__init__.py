@@ -5,7 +5,7 @@ inside them, so that ``--help`` and mistakes in the options come at once.
 
 Exit codes: 0 done, 1 an error of ours (with its traceback) or a failed job of a sweep, 2 a mistake in the
 options, 3 an environment that failed for good (a checkpoint is written first), 4 a run that ended but most of
-whose updates were rolled back, 130 and 143 ended by SIGINT and SIGTERM.
+whose updates were rolled back, 130, 138 and 143 ended by SIGINT, SIGUSR1 and SIGTERM.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 
@@ -9,7 +10,6 @@ from mappo_unity.config.schema import Config
 from mappo_unity.signals import interrupts_wait
 
 _MOST_ROLLED_BACK = 4
-_SIGNALS = {2: "SIGINT", 15: "SIGTERM"}
 
 
 def help_text() -> str:
@@ -53,7 +53,7 @@ def _train(lines: list[str], file: Path | None) -> int:
     if outcome.signal is None:
         return _MOST_ROLLED_BACK if outcome.status == "diverged" else 0
 
-    name = _SIGNALS.get(outcome.signal, f"signal {outcome.signal}")
+    name = signal.Signals(outcome.signal).name
     print(
         f"mappo-train: ended by {name}; checkpoint {outcome.last_checkpoint}; "
         f"resume with: mappo-train {shell_argument('resume', folder)}",

@@ -53,17 +53,17 @@ def _check_workers(given: list[str], configs: list[Config]) -> None:
     if any(_has_processes(config) for config in configs):
         return
     for config in configs:
-        asks = config.collect.engine is Engine.processes and not config.collect.workers
+        asks = config.collect.engine is not Engine.local and not config.collect.workers
         if "collect.timeout_s" in given or ("collect.engine" in given and asks):
             key = "collect.timeout_s" if "collect.timeout_s" in given else "collect.engine"
             raise ConfigError(
                 f"{_shown(key, config)} has no effect without processes of workers: give collect.workers=2 "
-                "(with collect.engine=processes), or leave it out"
+                "(with collect.engine=processes or ray), or leave it out"
             )
 
 
 def _has_processes(config: Config) -> bool:
-    return config.collect.workers > 0 and config.collect.engine is Engine.processes
+    return config.collect.workers > 0 and config.collect.engine is not Engine.local
 
 
 def _message(key: str, value: Any, backends: list[Backend], needed: tuple[Backend, ...]) -> str:

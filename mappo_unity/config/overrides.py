@@ -28,10 +28,12 @@ from mappo_unity.config.text_lines import LINE, parse_or_none, quoted_path
 from mappo_unity.errors import ConfigError
 
 SWEEP_EXTRA = {
-    "hydra/launcher=joblib": "hydra_joblib_launcher",
-    "hydra/sweeper=optuna": "hydra_optuna_sweeper",
+    "hydra/launcher=joblib": ("hydra_joblib_launcher", "sweep"),
+    "hydra/launcher=submitit_local": ("hydra_submitit_launcher", "slurm"),
+    "hydra/launcher=submitit_slurm": ("hydra_submitit_launcher", "slurm"),
+    "hydra/sweeper=optuna": ("hydra_optuna_sweeper", "sweep"),
 }
-"""Presets of conf/hydra that need a plugin, and the plugin's package."""
+"""Presets of conf/hydra that need a plugin: the plugin's package, and the extra that brings it."""
 LARGEST = 2**63 - 1
 """The largest whole number that files and tensors hold."""
 
@@ -182,11 +184,11 @@ def _check_hydra(override: Override, line: str) -> None:
         choices = ", ".join(describe_choices(key)) or "see its documentation"
         raise ConfigError(f"{key}={show_value(override.value())} does not exist; choices: {choices}")
 
-    package = SWEEP_EXTRA.get(line)
-    if package is not None and not is_installed(f"hydra_plugins.{package}"):
+    package, extra = SWEEP_EXTRA.get(line, ("", ""))
+    if package and not is_installed(f"hydra_plugins.{package}"):
         raise ConfigError(
             f"{line} needs the package {package.replace('_', '-')}, which is not installed: "
-            f"{install_command('sweep')}"
+            f"{install_command(extra)}"
         )
 
 

@@ -602,6 +602,7 @@ class Engine(Enum):
 
     local = "local"
     processes = "processes"
+    ray = "ray"
 
 
 @dataclass
@@ -615,7 +616,8 @@ class CollectConfig:
     workers: int = 0
     """Workers that share env.num_areas or env.num_players; 0: one environment in this process."""
     engine: Engine = Engine.processes
-    """Where workers run: each in its own process (processes), or one after another in this one (local)."""
+    """Where workers run: each in its own process (processes), one after another in this one (local), or as
+    actors of Ray (ray): of the cluster that RAY_ADDRESS names, or of one that is started here."""
     overlap: bool = False
     """Workers collect the next batch while this one is learnt from, with the weights before it."""
     timeout_s: float = 300.0
@@ -626,10 +628,10 @@ class CollectConfig:
         _at_least("collect.rounds", self.rounds, 1)
         _at_least("collect.workers", self.workers, 0)
         _above("collect.timeout_s", self.timeout_s, 0)
-        if self.overlap and (not self.workers or self.engine is not Engine.processes):
+        if self.overlap and (not self.workers or self.engine is Engine.local):
             raise ConfigError(
-                "collect.overlap=true needs collect.workers=1 or more with collect.engine=processes: in one "
-                "process nothing is collected while it learns"
+                "collect.overlap=true needs collect.workers=1 or more with collect.engine=processes or ray: "
+                "in one process nothing is collected while it learns"
             )
 
 

@@ -14,6 +14,8 @@ from pathlib import Path
 
 import torch
 
+from mappo_unity.config.extras import install_command
+from mappo_unity.config.overrides import is_installed
 from mappo_unity.config.per_behavior import TRAIN, is_frozen
 from mappo_unity.config.schema import CollectConfig, Config, Engine
 from mappo_unity.errors import ConfigError
@@ -24,8 +26,8 @@ from mappo_unity.runs.rng import seed_everything
 from mappo_unity.training.collection.batches import Batch, count_decisions
 from mappo_unity.training.collection.description import Played, describe
 from mappo_unity.training.collection.fleet import Batches, Fleet, SoleWorker
-from mappo_unity.training.collection.processes import WorkerProcesses
 from mappo_unity.training.collection.several_workers import LocalWorkers
+from mappo_unity.training.collection.shared_memory import WorkerProcesses
 from mappo_unity.training.learners import make_learners
 from mappo_unity.training.lessons.curriculum import lessons_of
 
@@ -139,7 +141,19 @@ def make_fleet(cfg: Config, folder: Path) -> Fleet:
         return SoleWorker(cfg, folder)
     if cfg.collect.engine is Engine.local:
         return LocalWorkers(cfg, folder)
+    if cfg.collect.engine is Engine.ray:
+        return _ray_workers(cfg, folder)
     return WorkerProcesses(cfg, folder)
+
+
+def _ray_workers(cfg: Config, folder: Path) -> Fleet:
+    if not is_installed("ray"):
+        raise ConfigError(
+            f"collect.engine=ray needs the package ray, which is not installed: {install_command('ray')}"
+        )
+    from mappo_unity.training.collection.on_ray.fleet import RayWorkers
+
+    return RayWorkers(cfg, folder)
 
 
 def prepare_torch(cfg: Config) -> None:

@@ -1,4 +1,4 @@
-"""How SIGINT and SIGTERM end a training run: after its iteration, or, where that takes long, at once.
+"""How signals end a training run: after its iteration, or, where that takes long, at once.
 
 The loop looks at `StopSignals.signal` between iterations; in the middle of one `Interrupted` is raised.
 """
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from mappo_unity.signals import DUPLICATE_SIGNAL_S, Interrupted, handled
+from mappo_unity.signals import DUPLICATE_SIGNAL_S, Interrupted, handled, scheduler_signals
 
 PATIENCE_S = 5.0  # after a signal, before the iteration is given up
 
@@ -35,8 +35,8 @@ class StopSignals:
 
     @contextmanager
     def taken(self) -> Iterator[None]:
-        """Take SIGINT and SIGTERM during the block."""
-        with handled(self._on_signal, signal.SIGINT, signal.SIGTERM):
+        """Take SIGINT, SIGTERM and a scheduler's signals during the block."""
+        with handled(self._on_signal, signal.SIGINT, signal.SIGTERM, *scheduler_signals()):
             try:
                 yield
             finally:
@@ -46,7 +46,8 @@ class StopSignals:
     def ignored(self) -> Iterator[None]:
         """Take no notice of signals during the block, in which a checkpoint is written."""
         self.end_patience()
-        with handled(lambda number, frame: None, signal.SIGINT, signal.SIGTERM):
+        numbers = (signal.SIGINT, signal.SIGTERM, *scheduler_signals())
+        with handled(lambda number, frame: None, *numbers):
             yield
 
     def end_patience(self) -> None:

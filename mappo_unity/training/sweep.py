@@ -39,6 +39,7 @@ from mappo_unity.signals import Interrupted, interrupts_wait
 from mappo_unity.training.plan import Plan, plan_jobs
 from mappo_unity.training.sweep_signals import (
     SweepSignalHandler,
+    hand_to_launcher,
     in_process_of_its_own,
     job_signals,
     sweep_signals,
@@ -150,6 +151,7 @@ def _run_job(tree: DictConfig) -> float | None:
     write_atomically(folder / RESULT, (json.dumps(asdict(result), indent=2) + "\n").encode())
 
     if ended_by is not None:
+        hand_to_launcher(ended_by)
         raise Interrupted(ended_by)
     return result.return_mean
 
@@ -176,10 +178,13 @@ def _train(config: Config, folder: Path, result: JobResult) -> int | None:
     write_record(folder, config, result.overrides)
     check_factory(config.env)
     with interrupts_wait():
+        from mappo_unity.runs.checkpoint import checkpoints_in, newest_good
         from mappo_unity.training.trainer import train
 
+    # the folder was new: what lies there is of this job, which its scheduler has started again
+    checkpoint = newest_good(folder)[0] if checkpoints_in(folder) else None
     with job_of_sweep(result.job, in_process_of_its_own()):
-        outcome = train(config, folder)
+        outcome = train(config, folder, checkpoint)
 
     result.status = outcome.status
     # JSON has no nan

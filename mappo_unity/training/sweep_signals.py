@@ -16,7 +16,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from mappo_unity.signals import DUPLICATE_SIGNAL_S, Interrupted, handled, termination_as_interrupt
+from mappo_unity.signals import (
+    DUPLICATE_SIGNAL_S,
+    Interrupted,
+    handled,
+    scheduler_signals,
+    termination_as_interrupt,
+)
 
 GRACE_S = 30.0
 
@@ -92,6 +98,15 @@ def _waiting(patience: SweepSignalHandler) -> Iterator[None]:
             yield
         finally:
             patience.end()
+
+
+def hand_to_launcher(number: int) -> None:
+    """Give a scheduler's signal that has ended a job to a launcher that takes it, to have it started again.
+
+    Submitit's handler raises SystemExit.
+    """
+    if number in scheduler_signals() and callable(signal.getsignal(number)):
+        signal.raise_signal(number)
 
 
 class _JobProcess:

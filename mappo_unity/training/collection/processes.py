@@ -1,7 +1,8 @@
-"""Workers in processes of their own; one that is killed, raises or hangs is replaced.
+"""Workers in processes of their own, on this machine or on others; one that is lost is replaced.
 
-The replacement has a fresh environment and the weights of the batch that is missing, and collects it again;
-what was pending of the lost one's agents teaches nothing.
+A worker is lost that is killed, raises what is ours, or hangs. The replacement has a fresh environment and
+the weights of the batch that is missing, and collects it again; what was pending of the lost one's agents
+teaches nothing.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ import atexit
 import logging
 import pickle
 import time
+from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError, EnvironmentFailure
@@ -23,23 +26,18 @@ from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.description import Description
 from mappo_unity.training.collection.several_workers import Answers, SeveralWorkers, packed
-from mappo_unity.training.collection.slab import Layout, SharedBytes, make_layout
 from mappo_unity.training.collection.worker import Weights
-from mappo_unity.training.collection.worker_handle import WorkerLost, WorkerProcess
-from mappo_unity.training.collection.worker_process import COLLECT, SLAB, SPACE
+from mappo_unity.training.collection.worker_handle import WorkerHandle, WorkerLost
+from mappo_unity.training.collection.worker_process import COLLECT
 
 CLOSE_S = 10.0
 """Given to all workers together to close their environments."""
-ROOM = 2
-"""Rounds that shared memory has room for, in units of the first batch; unused pages take no memory."""
-
-_Slabs = dict[int, tuple[Layout, SharedBytes]]  # by their capacity
 
 logger = logging.getLogger(__name__)
 
 
-class WorkerProcesses(SeveralWorkers):
-    """Workers in processes of their own.
+class RemoteWorkers(SeveralWorkers):
+    """Workers in processes of their own; what is abstract says how these are started and give their rounds.
 
     Args:
         cfg: the run's options.
@@ -53,22 +51,21 @@ class WorkerProcesses(SeveralWorkers):
 
     def __init__(self, cfg: Config, folder: Path) -> None:
         count = cfg.collect.workers
-        self._folder = folder
-        self.processes: list[WorkerProcess] = []
+        self._cfg, self._folder = cfg, folder
+        self.processes: list[WorkerHandle] = []
         self._restarts = [0] * count  # how often each worker was replaced
         self._players = [0] * count  # restarts of players of each worker
         self._players_before = [0] * count  # likewise, of those that it replaced
         self._lost: set[int] = set()  # those replaced since the last batch
-        self._policy: tuple[bytes, bool] | None = None
+        self._policy: tuple[Any, bool] | None = None
         self._asked: tuple[Any, ...] | None = None  # the request under way
-        self._set = 0  # of shared memory, which the batch under way is written to
-        self._slabs: tuple[_Slabs, _Slabs] = ({}, {})
+        self._set = 0  # 0 and 1 take turns: the way of the rounds of the batch under way
 
         atexit.register(self.close)  # before multiprocessing waits for its processes
         try:
             # all start before the first is waited for
             for number in range(count):
-                self.processes.append(WorkerProcess(cfg, number, folder))
+                self.processes.append(self._open(number, 0))
             super().__init__(cfg, [self._first(number) for number in range(count)])
         except BaseException:
             self.close()
@@ -76,7 +73,7 @@ class WorkerProcesses(SeveralWorkers):
 
     def start(self, policy: JointPolicy, keeps_ends: bool) -> None:
         """Hand out copies of the policy."""
-        taken = packed(policy), keeps_ends
+        taken = self._published(packed(policy)), keeps_ends
         self._call("take", *taken)
         self._policy = taken
 
@@ -89,34 +86,43 @@ class WorkerProcesses(SeveralWorkers):
         for process in self.processes:
             process.end(until - time.monotonic())
         self.processes = []
-        for slabs in self._slabs:
-            for _, block in slabs.values():
-                block.close()
-            slabs.clear()
+
+    @abstractmethod
+    def _open(self, number: int, restarts: int) -> WorkerHandle:
+        """Start a worker's process."""
+
+    def _published(self, data: bytes) -> Any:
+        """Return what stands for bytes in messages to all workers."""
+        return data
+
+    @abstractmethod
+    def _rounds(self, number: int, length: int, where: Any) -> TensorDictBase:
+        """Return a worker's rounds, from what it has said of them."""
+
+    def _side_by_side(self, lengths: list[int]) -> TensorDictBase | None:
+        """Return the rounds of all workers where they lie as those of one environment; None: they do not."""
+        return None
 
     # --- what `SeveralWorkers` asks for
 
     def _ask(self, weights: Weights | None, want_state: bool) -> None:
         self._set = 1 - self._set
-        self._asked = (COLLECT, pickle.dumps(weights), want_state, self._set)
+        self._asked = (COLLECT, self._published(pickle.dumps(weights)), want_state, self._set)
         for process in self.processes:
             process.send(*self._asked)
 
     def _answers(self) -> Answers:
-        batches, states, written = [], [], []
+        batches, states, lengths = [], [], []
         for number in range(len(self.processes)):
-            (batch, length, capacity), state = self._until_answered(number)
-            layout, block = self._slabs[self._set][capacity]
-            batch.rounds = layout.rounds(block.bytes, length, number)
+            (batch, length, where), state = self._until_answered(number)
+            batch.rounds = self._rounds(number, length, where)
             self._count_losses(batch, number)
             batches.append(batch)
             states.append(state)
-            written.append((length, capacity))
+            lengths.append(length)
         self._asked = None
         self._lost.clear()
-
-        is_joined = len(set(written)) == 1
-        return Answers(batches, states, layout.rounds(block.bytes, length) if is_joined else None)
+        return Answers(batches, states, self._side_by_side(lengths))
 
     def _call(self, method: str, *arguments: Any) -> list[Any]:
         assert self._asked is None, "a worker that collects answers nothing else"
@@ -152,21 +158,7 @@ class WorkerProcesses(SeveralWorkers):
                 self.processes[number].send(*(self._asked or message))
 
     def _answer(self, number: int) -> Any:
-        """Return a worker's answer, and give it memory where it asks for that."""
-        kind, content = self.processes[number].receive()
-        if kind == SPACE:
-            length, rows = content
-            slabs = self._slabs[self._set]
-            capacity = max(slabs, default=0)
-            if capacity < length:
-                # smaller memory stays: others may write to it
-                capacity = ROOM * length
-                layout = make_layout(rows, self._parts, capacity)
-                slabs[capacity] = layout, SharedBytes(layout.size)
-            layout, block = slabs[capacity]
-            self.processes[number].send(SLAB, block.path, layout)
-            kind, content = self.processes[number].receive()
-        return content
+        return self.processes[number].receive()[1]
 
     def _replace(self, number: int, loss: WorkerLost) -> None:
         """Put a fresh worker in the place of one that was lost.
@@ -196,9 +188,9 @@ class WorkerProcesses(SeveralWorkers):
             except WorkerLost as again:
                 loss = again
 
-    def _fresh(self, number: int) -> WorkerProcess:
+    def _fresh(self, number: int) -> WorkerHandle:
         """Return a new worker with the policy and the parameters in force."""
-        process = WorkerProcess(self._cfg, number, self._folder, self._restarts[number])
+        process = self._open(number, self._restarts[number])
         try:
             _, description = process.receive()
             if description.behaviors != self._parts[number].behaviors:

@@ -1,4 +1,4 @@
-"""The driver's end of a worker in a process of its own."""
+"""The driver's end of a worker in a process of its own: any, and one of this machine."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pickle
 import signal
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
@@ -38,16 +39,63 @@ class WorkerLost(Exception):
     """A worker is gone, or of no more use; the text says how."""
 
 
-class WorkerProcess:
-    """The driver's end of a worker in a process of its own.
+class WorkerHandle(ABC):
+    """The driver's end of a worker that answers messages (see `worker_process`).
+
+    Attributes: `timeout_s`, seconds without a round after which it is lost.
+    """
+
+    timeout_s: float
+
+    @property
+    @abstractmethod
+    def pid(self) -> int | None:
+        """Id of its process, on its machine."""
+
+    @abstractmethod
+    def send(self, *message: Any) -> None:
+        """Send a message; `receive` notices where nobody takes it."""
+
+    def receive(self) -> tuple[str, Any]:
+        """Wait for a message that is no error.
+
+        Raises:
+            WorkerLost: the process has ended, an exception of ours or of the machine came, or no round was
+                played within `collect.timeout_s`.
+            ConfigError, EnvironmentFailure: what the environment raised.
+        """
+        kind, content = self._message()
+        if kind != ERROR:
+            return kind, content
+
+        report: Report = content
+        if report.error is not None:
+            raise report.error
+        raise WorkerLost(f"it raised {report.text}")
+
+    @abstractmethod
+    def _message(self) -> tuple[str, Any]: ...
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Ask it to close its environment and end, also in the middle of a batch."""
+
+    @abstractmethod
+    def end(self, within_s: float = 0.0) -> None:
+        """End the process, at once after some seconds; its players go with it."""
+
+    def _silent(self) -> WorkerLost:
+        return WorkerLost(f"it has played no round for collect.timeout_s={self.timeout_s:g} s")
+
+
+class WorkerProcess(WorkerHandle):
+    """The driver's end of a worker in a process of its own, on this machine.
 
     Args:
         cfg: the run's options.
         number: of the worker.
         folder: of the run.
         restarts: how often the worker was replaced.
-
-    Attributes: `timeout_s`, seconds without a round after which it is lost.
     """
 
     def __init__(self, cfg: Config, number: int, folder: Path, restarts: int = 0) -> None:
@@ -74,23 +122,6 @@ class WorkerProcess:
         with suppress(OSError):
             self._pipe.send_bytes(pickle.dumps(message))
 
-    def receive(self) -> tuple[str, Any]:
-        """Wait for a message that is no error.
-
-        Raises:
-            WorkerLost: the process has ended, an exception of ours or of the machine came, or no round was
-                played within `collect.timeout_s`.
-            ConfigError, EnvironmentFailure: what the environment raised.
-        """
-        kind, content = self._message()
-        if kind != ERROR:
-            return kind, content
-
-        report: Report = content
-        if report.error is not None:
-            raise report.error
-        raise WorkerLost(f"it raised {report.text}")
-
     def _message(self) -> tuple[str, Any]:
         rounds, since = int(self._pulse[ROUNDS]), time.monotonic()
         connection: Connection = self._pipe
@@ -109,7 +140,7 @@ class WorkerProcess:
             if now != before:
                 rounds, since = now, time.monotonic()
             elif time.monotonic() - since > self.timeout_s:
-                raise WorkerLost(f"it has played no round for collect.timeout_s={self.timeout_s:g} s")
+                raise self._silent()
 
     def stop(self) -> None:
         """Ask it to close its environment and end, also in the middle of a batch."""

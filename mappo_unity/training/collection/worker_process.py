@@ -2,7 +2,8 @@
 
 A message is a pickled tuple. To the worker: a method of `Worker` and its arguments, or `COLLECT`, `SLAB`,
 `CLOSE`. From it: (`OK`, what the method returned), (`SPACE`, rounds, rows) where a batch has no room in the
-memory that it knows, or (`ERROR`, `Report`). Tensors of a batch travel in shared memory (`slab`).
+memory that it knows, or (`ERROR`, `Report`). Tensors of a batch travel in shared memory (`slab`), or as
+`on_ray` says.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import signal
 import sys
 import threading
 import traceback
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
@@ -21,14 +24,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.runs.rng import seed_everything
-from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.slab import Layout, open_bytes, rows_of, write
 from mappo_unity.training.collection.worker import Worker, make_worker, worker_config
 
@@ -49,8 +51,45 @@ class Report(NamedTuple):
     text: str
 
 
-class _Stopped(Exception):
+class Stopped(Exception):
     """The driver does not want the batch any more."""
+
+
+class Answering(ABC):
+    """Answer messages to a worker, however they come and go.
+
+    Args:
+        number: of the worker.
+        pulse: see `ROUNDS`.
+    """
+
+    def __init__(self, number: int, pulse: Tensor) -> None:
+        self._number, self._pulse = number, pulse
+
+    def answer(self, worker: Worker, method: str, arguments: Sequence[Any]) -> Any:
+        """Return what a method of the worker returns; raises `Stopped`."""
+        if method == COLLECT:
+            weights, want_state, which = arguments
+            message = worker.collect(pickle.loads(weights), want_state)
+            length = message.batch.rounds.shape[0]
+            where = self._hand_over(message.batch.rounds, which)
+            return (replace(message.batch, rounds=TensorDict({}, [length])), length, where), message.state
+        if method == "take":
+            packed_policy, keeps_ends = arguments
+            policy: JointPolicy = pickle.loads(packed_policy)
+            policy.register_forward_pre_hook(self._beat)
+            return worker.take(policy, keeps_ends)
+        return getattr(worker, method)(*arguments)
+
+    @abstractmethod
+    def _hand_over(self, rounds: TensorDictBase, which: int) -> Any:
+        """Bring a batch's rounds to the driver, by a set's way; return what it finds them by."""
+
+    def _beat(self, *arguments: Any) -> None:
+        """Say that a round is played; leave where nobody wants the batch any more."""
+        self._pulse[ROUNDS] += 1
+        if self._pulse[STOP]:
+            raise Stopped
 
 
 def main(cfg: Config, number: int, folder: Path, restarts: int, pulse: str, pipe: Connection) -> None:
@@ -80,11 +119,12 @@ def main(cfg: Config, number: int, folder: Path, restarts: int, pulse: str, pipe
         os._exit(1)  # the driver has gone
 
 
-class _Serving:
-    """Answer the driver's messages one by one."""
+class _Serving(Answering):
+    """Answer the driver's messages one by one, through a pipe and shared memory."""
 
     def __init__(self, number: int, pulse: Tensor, pipe: Connection) -> None:
-        self._number, self._pulse, self._pipe = number, pulse, pipe
+        super().__init__(number, pulse)
+        self._pipe = pipe
         self._slabs: dict[int, tuple[Layout, Tensor]] = {}  # by set, 0 or 1
 
     def serve(self, make: Any) -> None:
@@ -102,8 +142,8 @@ class _Serving:
                 if method == CLOSE:
                     return
                 try:
-                    self._send(OK, self._answer(worker, method, arguments))
-                except _Stopped:
+                    self._send(OK, self.answer(worker, method, arguments))
+                except Stopped:
                     return
                 except (EOFError, BrokenPipeError, ConnectionResetError):
                     raise
@@ -112,39 +152,20 @@ class _Serving:
         finally:
             worker.close()
 
-    def _answer(self, worker: Worker, method: str, arguments: list[Any]) -> Any:
-        if method == COLLECT:
-            weights, want_state, which = arguments
-            message = worker.collect(pickle.loads(weights), want_state)
-            return self._shared(message.batch, which), message.state
-        if method == "take":
-            packed_policy, keeps_ends = arguments
-            policy: JointPolicy = pickle.loads(packed_policy)
-            policy.register_forward_pre_hook(self._beat)
-            return worker.take(policy, keeps_ends)
-        return getattr(worker, method)(*arguments)
-
-    def _shared(self, batch: Batch, which: int) -> tuple[Batch, int, int]:
-        """Write a batch's rounds into a set's memory; return the rest, how many rounds, and its capacity."""
-        rounds = batch.rounds
+    def _hand_over(self, rounds: TensorDictBase, which: int) -> int:
+        """Write a batch's rounds into a set's memory; return its capacity."""
         length = rounds.shape[0]
         if which not in self._slabs or self._slabs[which][0].capacity < length:
             self._send(SPACE, (length, rows_of(rounds)))
             message = pickle.loads(self._pipe.recv_bytes())
             if message[0] == CLOSE:
-                raise _Stopped
+                raise Stopped
             _, path, layout = message
             self._slabs[which] = layout, open_bytes(path, layout.size)
 
         layout, block = self._slabs[which]
         write(rounds, layout, block, self._number)
-        return replace(batch, rounds=TensorDict({}, [length])), length, layout.capacity
-
-    def _beat(self, *arguments: Any) -> None:
-        """Say that a round is played; leave where nobody wants the batch any more."""
-        self._pulse[ROUNDS] += 1
-        if self._pulse[STOP]:
-            raise _Stopped
+        return layout.capacity
 
     def _send(self, kind: str, content: Any) -> None:
         self._pipe.send_bytes(pickle.dumps((kind, content)))
