@@ -100,6 +100,13 @@ class RatioKind(Enum):
     component = "component"
 
 
+class ObjectiveKind(Enum):
+    """What the probability ratio compares the policy with."""
+
+    clip = "clip"
+    decoupled = "decoupled"
+
+
 class EntropyKind(Enum):
     """How the entropies of continuous columns become one."""
 
@@ -387,6 +394,10 @@ class PPOConfig:
     ratio: RatioKind = RatioKind.joint
     """The probability ratio that is clipped: of the whole action (joint), or of each continuous column and
     each branch by itself, averaged (component, as ML-Agents)."""
+    objective: ObjectiveKind = ObjectiveKind.clip
+    """What the ratio, its clipping and the KL limits compare the policy with: the one that collected the
+    batch (clip), or the one that the update began with, beside importance weights (decoupled), see
+    collect.overlap."""
     epochs: int = 3
     """Passes over a batch."""
     minibatch_size: int = 1024

@@ -9,33 +9,32 @@ import math
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from mappo_unity import keys
-from mappo_unity.config.schema import ObsNormUpdate, PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
+from mappo_unity.config.schema import (
+    ObjectiveKind,
+    ObsNormUpdate,
+    PPOConfig,
+    RatioKind,
+    ValueNormKind,
+    ValueNormUpdate,
+)
 from mappo_unity.learning.advantage import (
-    Advantage,
     approximate_kl,
     estimate_streams,
     last_mean,
     make_view,
     masked_mean,
-    normalize,
     scheduled,
     value_metrics,
 )
 from mappo_unity.learning.carried import VALUED, CarriedRounds, has_value
 from mappo_unity.learning.imitation.cloning import Cloning
-from mappo_unity.learning.loss import (
-    ACTOR_LEARNS,
-    BASELINE,
-    CRITIC_LEARNS,
-    MaskedClipPPOLoss,
-    move_with_minibatch,
-)
+from mappo_unity.learning.loss import ACTOR_LEARNS, MaskedClipPPOLoss, move_with_minibatch
 from mappo_unity.learning.minibatches import make_buffer
 from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
 from mappo_unity.learning.networks.encoders import running_norms, update_norms
@@ -48,10 +47,12 @@ from mappo_unity.learning.optimizer import (
     make_optimizer,
     set_learning_rates,
 )
+from mappo_unity.learning.proximal import enter_proximal
 from mappo_unity.learning.rewards.streams import RewardStreams
 from mappo_unity.learning.rows import make_rows
-from mappo_unity.learning.value_norm import ValueNorm, by_stream, move_statistics
-from mappo_unity.learning.value_reader import ValueReader, Values
+from mappo_unity.learning.targets import enter_masks, enter_targets
+from mappo_unity.learning.value_norm import ValueNorm, by_stream
+from mappo_unity.learning.value_reader import ValueReader
 
 
 class PolicyLearner:
@@ -139,7 +140,14 @@ class PolicyLearner:
 
         ended = rounds.get(keys.TERMINATED) | rounds.get(keys.TRUNCATED)
         view = make_view(rounds.get(VALUED), has_value(following.get(keys.FINAL)), ended)
+        self.carried.keep(rounds, view)  # without what is entered below
+        enter_masks(rounds, view)
+        for name, state in values.states.items():
+            rounds.set(name, state)
+
         rewards, metrics = self.rewards.rewards(rounds, following, view)
+        if self.cfg.objective is ObjectiveKind.decoupled:
+            metrics |= enter_proximal(rounds, view, self.rows, self.loss)
         gae = estimate_streams(
             view,
             rewards,
@@ -151,45 +159,13 @@ class PolicyLearner:
             gae_lambda=self.cfg.gae_lambda,
             horizon=self.cfg.time_horizon,
         )
-        self.carried.keep(rounds, view)
         self.reader.keep(values, rounds.get(VALUED) & ~gae.known)
 
-        learns = gae.known & rounds.get(keys.ACTING)
+        learns = rounds.get(ACTOR_LEARNS)
         metrics |= value_metrics(self.rewards.names, values.value, gae.target, learns)
-        self._enter(rounds, values, gae, learns)
+        enter_targets(rounds, values, gae, self.value_norm, self.value_layers, self.cfg)
         rows, decisions = self.rows.of(rounds, view)
         return (make_buffer(rows, decisions, self.cfg) if len(rows) else None), metrics
-
-    def _enter(self, rounds: TensorDict, values: Values, gae: Advantage, learns: Tensor) -> None:
-        """Set the entries that the loss reads beside inputs and actions."""
-        # values were denormalised, and are normalised below: the statistics move in between
-        by_minibatch = self.cfg.value_norm_update is ValueNormUpdate.minibatch
-        if not by_minibatch:
-            move_statistics(
-                self.value_norm,
-                gae.target[gae.known.squeeze(-1)],
-                self.value_layers if self.cfg.normalize_values is ValueNormKind.popart else (),
-            )
-
-        advantage = gae.advantage
-        if values.baseline is not None:
-            advantage = torch.where(gae.known, gae.target - values.baseline, 0.0)
-        if len(self.rewards.names) > 1:
-            advantage = advantage.sum(-1, keepdim=True)
-        if self.cfg.normalize_advantages:
-            advantage = normalize(advantage, learns)
-
-        # where the statistics move with each minibatch, it normalises these itself
-        scaled = (lambda x: x) if by_minibatch else self.value_norm.normalize
-        rounds.set(keys.ADVANTAGE, advantage)
-        rounds.set(keys.VALUE_TARGET, scaled(gae.target))
-        rounds.set(keys.VALUE, scaled(values.value))
-        if values.baseline is not None:
-            rounds.set(BASELINE, scaled(values.baseline))
-        for name, state in values.states.items():
-            rounds.set(name, state)
-        rounds.set(ACTOR_LEARNS, learns)
-        rounds.set(CRITIC_LEARNS, gae.known)
 
     def update(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Run the epochs; take everything back if a number is not finite or the KL explodes."""

@@ -1,0 +1,49 @@
+"""The proximal policy: the one that an update begins with, beside the older one that collected the batch.
+
+The two differ where a batch is collected while the one before is learnt from (``collect.overlap``), in
+decisions that were pending when the batch before ended, and where normalisers moved while it was collected.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from mappo_unity import keys
+from mappo_unity.learning.advantage import approximate_kl
+from mappo_unity.learning.decisions import DecisionView
+from mappo_unity.learning.loss import ACTOR_LEARNS, PROXIMAL, MaskedClipPPOLoss
+from mappo_unity.learning.rows import SequenceRows, TeamRows
+
+
+@torch.no_grad()
+def enter_proximal(
+    rounds: TensorDict, view: DecisionView, rows: TeamRows | SequenceRows, loss: MaskedClipPPOLoss
+) -> dict[str, float]:
+    """Set the log-probabilities that the policy, as it is now, gives what is learnt; return a metric.
+
+    They are read row by row, or with a memory sequence by sequence, as the loss is going to read them: before
+    the first step of the optimizer all ratios are 1.
+
+    Args:
+        rounds: ``[R, ..., A]`` with `ACTOR_LEARNS` and the critic's states; `PROXIMAL` is set.
+        view: of the rounds.
+        rows: what the update is going to draw its minibatches from.
+        loss: reads the policy.
+
+    Returns:
+        ``stale_kl``, the approximate KL between the policy that collected the batch and the proximal one.
+    """
+    if not bool(rounds.get(ACTOR_LEARNS).any()):
+        return {}
+    rows.fill(rounds, view, PROXIMAL, loss.log_probs)
+    log_ratio = joint_log_ratio(rounds)
+    return {"stale_kl": float(approximate_kl(log_ratio, log_ratio.exp(), rounds.get(ACTOR_LEARNS)))}
+
+
+def joint_log_ratio(rounds: TensorDict) -> Tensor:
+    """Return log pi_proximal - log pi_behavior of whole actions ``[R, ..., A, 1]``, 0 where nobody learns."""
+    proximal = rounds.get(PROXIMAL).sum(-1, keepdim=True)
+    log_ratio = proximal - rounds.get(keys.LOG_PROB).unsqueeze(-1)
+    return torch.where(rounds.get(ACTOR_LEARNS), log_ratio, 0.0)
