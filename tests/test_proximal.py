@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,15 @@ from test_ppo import A, G, T, make_batch, make_learner
 
 from mappo_unity import keys
 from mappo_unity.config.compose import compose_config
-from mappo_unity.config.schema import CriticKind, MemoryKind, ObjectiveKind, RatioKind
+from mappo_unity.config.schema import (
+    AdvantageKind,
+    CriticKind,
+    MemoryKind,
+    ObjectiveKind,
+    RatioKind,
+    ValueNormKind,
+)
+from mappo_unity.errors import ConfigError
 from mappo_unity.learning.loss import ACTOR_LEARNS, MOST_WEIGHT, PROXIMAL
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.training.setup import set_up
@@ -173,7 +182,61 @@ def test_updates_of_overlapping_batches_begin_at_one(objective: ObjectiveKind, t
         assert all(row["stale_kl"] > 1e-6 for row in metrics[1:])
 
 
-@pytest.mark.parametrize("value", ["clipped", "1"])
-def test_another_objective_is_refused(value: str) -> None:
-    with pytest.raises(Exception, match=r"ppo\.objective.*clip.*decoupled"):
-        compose_config([f"ppo.objective={value}"])
+# --- V-trace
+
+
+@pytest.mark.parametrize("critic", [CriticKind.central, CriticKind.poca])
+@pytest.mark.parametrize("ratio", list(RatioKind))
+def test_what_an_older_policy_did_counts_less(ratio: RatioKind, critic: CriticKind) -> None:
+    same = {"normalize_advantages": False, "normalize_values": ValueNormKind.none, "ratio": ratio}
+    batch = batch_of(make_learner(model={"critic": critic}, **same))
+
+    def rows(shift: float, kind: AdvantageKind, gae_lambda: float) -> Any:
+        learner = make_learner(model={"critic": critic}, **same, advantage=kind, gae_lambda=gae_lambda)
+        older = batch.clone()
+        older["action_log_prob"] += shift  # of every action alike
+        return learner.prepare(*whole(older))[0][:]
+
+    # rho 0.5 everywhere is a lambda of half the size, and targets half as far from the values
+    found = rows(math.log(2), AdvantageKind.vtrace, 0.8)
+    wanted = rows(0.0, AdvantageKind.gae, 0.4)
+    assert torch.allclose(found["advantage"], wanted["advantage"], atol=1e-5)
+    moved = found["value_target"] - found["state_value"]
+    assert torch.allclose(moved, 0.5 * (wanted["value_target"] - wanted["state_value"]), atol=1e-5)
+    assert moved.abs().max() > 0.1
+
+    # actions that are likelier now than they were count as they are
+    found, wanted = rows(-1.0, AdvantageKind.vtrace, 0.8), rows(0.0, AdvantageKind.gae, 0.8)
+    assert torch.equal(found["advantage"], wanted["advantage"])
+
+
+def test_departed_members_have_no_action_to_correct() -> None:
+    acting = torch.ones(T, G, A, 1, dtype=torch.bool)
+    acting[:, :, 1] = False
+    same = {"normalize_values": ValueNormKind.none, "gae_lambda": 0.8}
+    batch = make_batch(make_learner(), acting)
+    batch["departed"] = batch["next", "departed"] = ~acting
+    batch["action_log_prob"] += math.log(2)
+    targets = []
+    for kind in AdvantageKind:
+        rows = make_learner(advantage=kind, **same).prepare(*whole(batch.clone()))[0][:]
+        targets.append(rows["value_target"].transpose(0, 1))
+    assert torch.equal(targets[0][1], targets[1][1]) and not torch.allclose(targets[0][0], targets[1][0])
+
+
+def test_a_batch_in_which_nobody_learns() -> None:
+    learner = make_learner(objective=DECOUPLED, advantage=AdvantageKind.vtrace)
+    batch = make_batch(learner, torch.zeros(T, G, A, 1, dtype=torch.bool))
+    assert learner.prepare(*whole(batch))[0] is None
+
+
+# --- options
+
+
+@pytest.mark.parametrize(
+    ("option", "choices"),
+    [("ppo.objective=clipped", "clip.*decoupled"), ("ppo.advantage=td", "gae.*vtrace")],
+)
+def test_what_is_not_there_is_refused(option: str, choices: str) -> None:
+    with pytest.raises(ConfigError, match=rf"{option.split('=')[0]}.*{choices}"):
+        compose_config([option])

@@ -107,6 +107,13 @@ class ObjectiveKind(Enum):
     decoupled = "decoupled"
 
 
+class AdvantageKind(Enum):
+    """How advantages and value targets are estimated."""
+
+    gae = "gae"
+    vtrace = "vtrace"
+
+
 class EntropyKind(Enum):
     """How the entropies of continuous columns become one."""
 
@@ -382,6 +389,9 @@ class PPOConfig:
     """Discount of a decision."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation."""
+    advantage: AdvantageKind = AdvantageKind.gae
+    """How advantages are estimated: as if the policy had collected the batch itself (gae), or corrected for
+    what an older one did (vtrace), see collect.overlap."""
     time_horizon: Optional[int] = None
     """Decisions of an agent after which its advantages are cut, and a value stands for the rest (as in
     ML-Agents); null: they are cut only where a batch ends."""

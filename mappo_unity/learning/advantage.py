@@ -14,6 +14,16 @@ is the value of the terminal observation and A_next is 0. Rounds without a value
 unchanged. A decision whose outcome has not arrived when the batch ends has no advantage (``known`` is False);
 the rows before it bootstrap from its value. With a value in every round this is GAE (Schulman et al., arXiv
 1506.02438, eq. 16).
+
+V-trace (Espeholt et al., arXiv 1802.01561, eq. 1 with rho-bar = c-bar = 1) corrects it where an older policy
+chose the actions. With rho_k = min(1, pi / pi_behavior) of each decision
+
+    A_k    = delta_k + gamma * gae_lambda * rho_next * A_next
+    target = V_k + rho_k * A_k
+
+The targets are the paper's, lambda as in its remark 2. Advantages mix V_next and the next target by lambda,
+as rlax has them, and bear no rho_k of their own: the objective's ratio is there for that. Where all rho_k are
+1 this is the recursion above.
 """
 
 from __future__ import annotations
@@ -34,7 +44,7 @@ class Advantage(NamedTuple):
     """Result of `estimate` and `estimate_streams`."""
 
     advantage: Tensor  # float32 as the values, 0 where not known
-    target: Tensor  # float32 as the values, value targets (advantage + value), 0 where not known
+    target: Tensor  # float32 as the values, value targets, 0 where not known
     known: Tensor  # bool [T, ...]: rows with a decision whose outcome has arrived
 
 
@@ -54,6 +64,7 @@ def estimate(
     gamma: float,
     gae_lambda: float,
     horizon: int | None = None,
+    rho_T: Tensor | None = None,
 ) -> Advantage:
     """Estimate advantages of slots that do not act in every round, by the recursion above.
 
@@ -67,12 +78,19 @@ def estimate(
         gamma: discount of a decision.
         gae_lambda: lambda.
         horizon: decisions of a slot after which A_next counts as 0; None: nowhere but where the batch ends.
+        rho_T: float32 ``[T, ...]``, V-trace's rho, 1 in rows without an action; None: no correction.
     """
     value = _flat(value_T)
     following = view.next_values(value, _row(final_value), _flat(end_value_T), _flat(truncated_T))
     delta = view.rewards(_flat(reward_T)) + np.float32(gamma) * following - value
-    advantage = view.scan(delta, gamma * gae_lambda, horizon)
-    target = np.where(view.known, advantage + value, np.float32(0))
+    if rho_T is None:
+        advantage = moved = view.scan(delta, gamma * gae_lambda, horizon)
+    else:
+        rho = _flat(rho_T)
+        decay = np.float32(gamma * gae_lambda) * view.onward(rho, np.ones_like(rho[0]))
+        advantage = view.scan(delta, decay, horizon)
+        moved = rho * advantage
+    target = np.where(view.known, moved + value, np.float32(0))
 
     def back(values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).view(value_T.shape).to(value_T.device)
@@ -91,6 +109,7 @@ def estimate_streams(
     gammas: Sequence[float],
     gae_lambda: float,
     horizon: int | None = None,
+    rho_T: Tensor | None = None,
 ) -> Advantage:
     """Estimate advantages and targets ``[T, ..., V]`` of V reward streams, each as in `estimate`.
 
@@ -98,11 +117,16 @@ def estimate_streams(
         view: see `estimate`; so are the others, with a last dimension V.
         truncated_T: bool ``[T, ..., 1]``.
         gammas: the discount of each stream.
+        rho_T: float32 ``[T, ..., 1]``, or None.
     """
     columns = [x.split(1, -1) for x in (reward_T, value_T, end_value_T, final_value)]
     parts = [
         estimate(
-            view, reward, value, end, final, truncated_T, gamma=gamma, gae_lambda=gae_lambda, horizon=horizon
+            *(view, reward, value, end, final, truncated_T),
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            horizon=horizon,
+            rho_T=rho_T,
         )
         for gamma, reward, value, end, final in zip(gammas, *columns, strict=True)
     ]

@@ -16,7 +16,7 @@ from torchrl.data import ReplayBuffer
 
 from mappo_unity import keys
 from mappo_unity.config.schema import (
-    ObjectiveKind,
+    AdvantageKind,
     ObsNormUpdate,
     PPOConfig,
     RatioKind,
@@ -47,7 +47,7 @@ from mappo_unity.learning.optimizer import (
     make_optimizer,
     set_learning_rates,
 )
-from mappo_unity.learning.proximal import enter_proximal
+from mappo_unity.learning.proximal import enter_proximal, needs_proximal, truncated_ratio
 from mappo_unity.learning.rewards.streams import RewardStreams
 from mappo_unity.learning.rows import make_rows
 from mappo_unity.learning.targets import enter_masks, enter_targets
@@ -146,7 +146,7 @@ class PolicyLearner:
             rounds.set(name, state)
 
         rewards, metrics = self.rewards.rewards(rounds, following, view)
-        if self.cfg.objective is ObjectiveKind.decoupled:
+        if needs_proximal(self.cfg):
             metrics |= enter_proximal(rounds, view, self.rows, self.loss)
         gae = estimate_streams(
             view,
@@ -158,6 +158,7 @@ class PolicyLearner:
             gammas=self.rewards.gammas,
             gae_lambda=self.cfg.gae_lambda,
             horizon=self.cfg.time_horizon,
+            rho_T=truncated_ratio(rounds) if self.cfg.advantage is AdvantageKind.vtrace else None,
         )
         self.reader.keep(values, rounds.get(VALUED) & ~gae.known)
 

@@ -11,10 +11,13 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from mappo_unity import keys
+from mappo_unity.config.schema import AdvantageKind, ObjectiveKind, PPOConfig
 from mappo_unity.learning.advantage import approximate_kl
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.loss import ACTOR_LEARNS, PROXIMAL, MaskedClipPPOLoss
 from mappo_unity.learning.rows import SequenceRows, TeamRows
+
+MOST_RATIO = 1.0  # rho-bar and c-bar of V-trace (Espeholt et al., arXiv 1802.01561)
 
 
 @torch.no_grad()
@@ -40,6 +43,21 @@ def enter_proximal(
     rows.fill(rounds, view, PROXIMAL, loss.log_probs)
     log_ratio = joint_log_ratio(rounds)
     return {"stale_kl": float(approximate_kl(log_ratio, log_ratio.exp(), rounds.get(ACTOR_LEARNS)))}
+
+
+def needs_proximal(cfg: PPOConfig) -> bool:
+    """Return whether the options ask for what the proximal policy says."""
+    return cfg.objective is ObjectiveKind.decoupled or cfg.advantage is AdvantageKind.vtrace
+
+
+def truncated_ratio(rounds: TensorDict) -> Tensor | None:
+    """Return min(1, pi_proximal / pi_behavior) ``[R, ..., A, 1]`` of whole actions, 1 where nobody learns.
+
+    Of each agent's own action: what its mates chose otherwise is not corrected.
+    """
+    if PROXIMAL not in rounds.keys():  # nobody learns
+        return None
+    return joint_log_ratio(rounds).exp().clamp_max(MOST_RATIO)
 
 
 def joint_log_ratio(rounds: TensorDict) -> Tensor:

@@ -51,7 +51,7 @@ def enter_targets(
 
     advantage = gae.advantage
     if values.baseline is not None:
-        advantage = torch.where(gae.known, gae.target - values.baseline, 0.0)
+        advantage = torch.where(gae.known, gae.advantage + values.value - values.baseline, 0.0)
     if advantage.shape[-1] > 1:  # of several streams
         advantage = advantage.sum(-1, keepdim=True)
     if cfg.normalize_advantages:
