@@ -9,7 +9,8 @@ from masked import masked_gae
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from mappo_unity.config.schema import Schedule
-from mappo_unity.learning.advantage import explained_variance, masked_mean, normalize, scheduled
+from mappo_unity.learning.advantage import explained_variance, normalize, scheduled
+from mappo_unity.learning.reduction import masked_mean
 
 
 def gae(

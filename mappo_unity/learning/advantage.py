@@ -38,6 +38,7 @@ from torch import Tensor
 
 from mappo_unity.config.schema import Schedule
 from mappo_unity.learning.decisions import DecisionView
+from mappo_unity.learning.reduction import ALONE, Reduction
 
 
 class Advantage(NamedTuple):
@@ -146,59 +147,58 @@ def _row(values: Tensor) -> np.ndarray:
     return values.cpu().numpy().reshape(-1)
 
 
-def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the mean of ``values`` where ``mask`` holds (0 if nowhere; None: everywhere), a scalar."""
-    if mask is None:
-        return values.mean()
-    weight = mask.to(torch.get_default_dtype())
-    return (values * weight).sum() / weight.sum().clamp_min(1.0)
-
-
 def last_mean(values: Tensor) -> Tensor:
     """Return the mean over the last dimension, which becomes 1; where it is 1, the values themselves."""
     return values if values.shape[-1] == 1 else values.mean(-1, keepdim=True)
 
 
-def normalize(values: Tensor, mask: Tensor, eps: float = 1e-5) -> Tensor:
+def normalize(values: Tensor, mask: Tensor, eps: float = 1e-5, reduction: Reduction = ALONE) -> Tensor:
     """Return ``(values - mean) / (std + eps)`` with statistics over ``mask``; 0 elsewhere."""
-    mean = masked_mean(values, mask)
-    std = masked_mean((values - mean) ** 2, mask).sqrt()
+    mean = reduction.mean(values, mask)
+    std = reduction.mean((values - mean) ** 2, mask).sqrt()
     return torch.where(mask, (values - mean) / (std + eps), 0.0)
 
 
-def explained_variance(value: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+def explained_variance(value: Tensor, target: Tensor, mask: Tensor, reduction: Reduction = ALONE) -> Tensor:
     """Return ``1 - Var[target - value] / Var[target]`` over ``mask``; nan if the targets are equal."""
-    error = target - value
-    error_var = masked_mean((error - masked_mean(error, mask)) ** 2, mask)
-    target_var = masked_mean((target - masked_mean(target, mask)) ** 2, mask)
+    error, mean = target - value, reduction.mean
+    error_var = mean((error - mean(error, mask)) ** 2, mask)
+    target_var = mean((target - mean(target, mask)) ** 2, mask)
     return torch.where(target_var > 0, 1 - error_var / target_var, torch.nan)
 
 
-def value_metrics(names: Sequence[str], value: Tensor, target: Tensor, mask: Tensor) -> dict[str, float]:
+def value_metrics(
+    names: Sequence[str], value: Tensor, target: Tensor, mask: Tensor, reduction: Reduction = ALONE
+) -> dict[str, float]:
     """Return how well values ``[..., V]`` explain their targets, and their means.
 
     Args:
         names: of the streams; the first one's metrics have no prefix.
         mask: bool ``[..., 1]``, rows that count.
+        reduction: of several learners.
     """
     metrics = {}
     for number, name in enumerate(names):
         prefix = f"{name}_" if number else ""
         column, wanted = value[..., number : number + 1], target[..., number : number + 1]
-        metrics[f"{prefix}explained_variance"] = float(explained_variance(column, wanted, mask))
-        metrics[f"{prefix}value_mean"] = float(masked_mean(column, mask))
+        explained = explained_variance(column, wanted, mask, reduction)
+        metrics[f"{prefix}explained_variance"] = float(explained)
+        metrics[f"{prefix}value_mean"] = float(reduction.mean(column, mask))
     return metrics
 
 
-def approximate_kl(log_ratio: Tensor, ratio: Tensor, mask: Tensor | None) -> Tensor:
+def approximate_kl(
+    log_ratio: Tensor, ratio: Tensor, mask: Tensor | None, reduction: Reduction = ALONE
+) -> Tensor:
     """Return the approximate KL of ratios ``[..., n]`` of an action's n components, a scalar.
 
-    k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative.
+    k3 of http://joschu.net/blog/kl-approx.html: (r - 1) - log r, never negative. Of several learners it is
+    this one's part.
     """
     if log_ratio.shape[-1] > 1:
         log_ratio = log_ratio.sum(-1, keepdim=True)
         ratio = log_ratio.exp()
-    return masked_mean(ratio - 1 - log_ratio, mask)
+    return reduction.part(ratio - 1 - log_ratio, mask)
 
 
 def scheduled(schedule: Schedule, start: float, final: float, progress: float) -> float:

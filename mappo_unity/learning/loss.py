@@ -15,11 +15,12 @@ from torchrl.objectives import ClipPPOLoss
 
 from mappo_unity import keys
 from mappo_unity.config.schema import EntropyKind, ObjectiveKind, PPOConfig, RatioKind, ValueLoss
-from mappo_unity.learning.advantage import last_mean, masked_mean
+from mappo_unity.learning.advantage import last_mean
 from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import ActionDistribution
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import RecurrentCritic
+from mappo_unity.learning.reduction import ALONE, Reduction
 from mappo_unity.learning.value_norm import ValueNorm
 
 ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: it acted, and the outcome is known; absent: all
@@ -46,12 +47,15 @@ class MaskedClipPPOLoss(ClipPPOLoss):
     Args:
         actor, critic: see `learning.networks.actor_critic`.
         cfg: the learner's options.
+        reduction: of several learners; losses are then this one's part.
 
     Attributes: `log_ratio` and `ratio` ``[..., n]`` and `entropy` ``[..., 1]`` of the last call, without
     gradients; n is 1, or with ``ppo.ratio=component`` the components of an action.
     """
 
-    def __init__(self, actor: UnityActor, critic: TensorDictModule, cfg: PPOConfig) -> None:
+    def __init__(
+        self, actor: UnityActor, critic: TensorDictModule, cfg: PPOConfig, reduction: Reduction = ALONE
+    ) -> None:
         super().__init__(
             actor,
             critic,
@@ -61,7 +65,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
             normalize_advantage=False,
             functional=False,
         )
-        self.cfg = cfg
+        self.cfg, self._reduction = cfg, reduction
         self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
         self._actor, self._critic = actor, critic.module
         self.critic_keys = [str(key) for key in critic.in_keys]
@@ -84,10 +88,11 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         entropy = dist.entropy(mean=self.cfg.entropy is EntropyKind.mean).unsqueeze(-1)
         self.entropy = entropy.detach()
 
+        part = self._reduction.part
         return {
-            "loss_objective": -masked_mean(last_mean(gain), mask),
+            "loss_objective": -part(last_mean(gain), mask),
             "loss_critic": self.cfg.value_coef * self._critic_loss(rows, clip),
-            "loss_entropy": -self.entropy_coeff.item() * masked_mean(entropy, mask),
+            "loss_entropy": -self.entropy_coeff.item() * part(entropy, mask),
         }
 
     @torch.no_grad()
@@ -137,13 +142,13 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         value, baseline = self._values(rows)
 
         loss = self._distance(value, target, rows.get(keys.VALUE) if self.cfg.clip_value else None, clip)
-        loss = masked_mean(loss, mask)
+        loss = self._reduction.part(loss, mask)
         if baseline is None:
             return loss
 
         # ML-Agents clips the baseline's move, and not the value's
         beside = self._distance(baseline, target, rows.get(BASELINE), clip)
-        return loss + BASELINE_WEIGHT * masked_mean(beside, rows.get(ACTOR_LEARNS, None))
+        return loss + BASELINE_WEIGHT * self._reduction.part(beside, rows.get(ACTOR_LEARNS, None))
 
     def _values(self, rows: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         """Return values, and baselines where the critic has them."""

@@ -15,6 +15,7 @@ from mappo_unity.config.schema import AdvantageKind, ObjectiveKind, PPOConfig
 from mappo_unity.learning.advantage import approximate_kl
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.loss import ACTOR_LEARNS, PROXIMAL, MaskedClipPPOLoss
+from mappo_unity.learning.reduction import ALONE, Reduction
 from mappo_unity.learning.rows import SequenceRows, TeamRows
 
 MOST_RATIO = 1.0  # rho-bar and c-bar of V-trace (Espeholt et al., arXiv 1802.01561)
@@ -23,8 +24,8 @@ MOST_RATIO = 1.0  # rho-bar and c-bar of V-trace (Espeholt et al., arXiv 1802.01
 @torch.no_grad()
 def enter_proximal(
     rounds: TensorDict, view: DecisionView, rows: TeamRows | SequenceRows, loss: MaskedClipPPOLoss
-) -> dict[str, float]:
-    """Set the log-probabilities that the policy, as it is now, gives what is learnt; return a metric.
+) -> None:
+    """Set the log-probabilities that the policy, as it is now, gives what is learnt.
 
     They are read row by row, or with a memory sequence by sequence, as the loss is going to read them: before
     the first step of the optimizer all ratios are 1.
@@ -34,15 +35,16 @@ def enter_proximal(
         view: of the rounds.
         rows: what the update is going to draw its minibatches from.
         loss: reads the policy.
-
-    Returns:
-        ``stale_kl``, the approximate KL between the policy that collected the batch and the proximal one.
     """
-    if not bool(rounds.get(ACTOR_LEARNS).any()):
-        return {}
-    rows.fill(rounds, view, PROXIMAL, loss.log_probs)
+    if bool(rounds.get(ACTOR_LEARNS).any()):
+        rows.fill(rounds, view, PROXIMAL, loss.log_probs)
+
+
+def stale_kl(rounds: TensorDict, reduction: Reduction = ALONE) -> float:
+    """Return the approximate KL between the policy that collected the batch and the proximal one."""
     log_ratio = joint_log_ratio(rounds)
-    return {"stale_kl": float(approximate_kl(log_ratio, log_ratio.exp(), rounds.get(ACTOR_LEARNS)))}
+    kl = approximate_kl(log_ratio, log_ratio.exp(), rounds.get(ACTOR_LEARNS), reduction)
+    return float(reduction.whole(kl))
 
 
 def needs_proximal(cfg: PPOConfig) -> bool:
@@ -50,18 +52,18 @@ def needs_proximal(cfg: PPOConfig) -> bool:
     return cfg.objective is ObjectiveKind.decoupled or cfg.advantage is AdvantageKind.vtrace
 
 
-def truncated_ratio(rounds: TensorDict) -> Tensor | None:
+def truncated_ratio(rounds: TensorDict) -> Tensor:
     """Return min(1, pi_proximal / pi_behavior) ``[R, ..., A, 1]`` of whole actions, 1 where nobody learns.
 
     Of each agent's own action: what its mates chose otherwise is not corrected.
     """
-    if PROXIMAL not in rounds.keys():  # nobody learns
-        return None
     return joint_log_ratio(rounds).exp().clamp_max(MOST_RATIO)
 
 
 def joint_log_ratio(rounds: TensorDict) -> Tensor:
     """Return log pi_proximal - log pi_behavior of whole actions ``[R, ..., A, 1]``, 0 where nobody learns."""
-    proximal = rounds.get(PROXIMAL).sum(-1, keepdim=True)
-    log_ratio = proximal - rounds.get(keys.LOG_PROB).unsqueeze(-1)
-    return torch.where(rounds.get(ACTOR_LEARNS), log_ratio, 0.0)
+    learns, behavior = rounds.get(ACTOR_LEARNS), rounds.get(keys.LOG_PROB).unsqueeze(-1)
+    if PROXIMAL not in rounds.keys():
+        return torch.zeros_like(behavior)
+    log_ratio = rounds.get(PROXIMAL).sum(-1, keepdim=True) - behavior
+    return torch.where(learns, log_ratio, 0.0)

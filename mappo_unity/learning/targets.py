@@ -13,6 +13,7 @@ from mappo_unity.config.schema import PPOConfig, ValueNormKind, ValueNormUpdate
 from mappo_unity.learning.advantage import Advantage, normalize
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS
+from mappo_unity.learning.reduction import ALONE, Reduction
 from mappo_unity.learning.value_norm import ValueNorm, move_statistics
 from mappo_unity.learning.value_reader import Values
 
@@ -32,6 +33,7 @@ def enter_targets(
     norm: ValueNorm,
     layers: Sequence[nn.Linear],
     cfg: PPOConfig,
+    reduction: Reduction = ALONE,
 ) -> None:
     """Set the entries; the statistics of returns move on the way.
 
@@ -42,6 +44,7 @@ def enter_targets(
         norm: the statistics of returns.
         layers: what PopArt rescales.
         cfg: the learner's options.
+        reduction: of several learners.
     """
     # values were denormalised, and are normalised below: the statistics move in between
     by_minibatch = cfg.value_norm_update is ValueNormUpdate.minibatch
@@ -55,7 +58,7 @@ def enter_targets(
     if advantage.shape[-1] > 1:  # of several streams
         advantage = advantage.sum(-1, keepdim=True)
     if cfg.normalize_advantages:
-        advantage = normalize(advantage, rounds.get(ACTOR_LEARNS))
+        advantage = normalize(advantage, rounds.get(ACTOR_LEARNS), reduction=reduction)
 
     # where the statistics move with each minibatch, it normalises these itself
     scaled = (lambda x: x) if by_minibatch else norm.normalize
