@@ -23,6 +23,7 @@ def masked_gae(
     gamma: float,
     gae_lambda: float,
     horizon: int | None = None,
+    rho_T: Tensor | None = None,
 ) -> Advantage:
     """Build the decision view of these masks and estimate advantages; shapes as in `estimate`."""
     view = make_view(valued_T, final_valued, terminated_T | truncated_T)
@@ -36,6 +37,7 @@ def masked_gae(
         gamma=gamma,
         gae_lambda=gae_lambda,
         horizon=horizon,
+        rho_T=rho_T,
     )
 
 

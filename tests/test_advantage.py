@@ -2,13 +2,15 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from masked import masked_gae
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from mappo_unity.config.schema import Schedule
-from mappo_unity.learning.advantage import explained_variance, masked_mean, normalize, scheduled
+from mappo_unity.learning.advantage import explained_variance, normalize, scheduled
+from mappo_unity.learning.reduction import masked_mean
 
 
 def gae(
@@ -23,6 +25,7 @@ def gae(
     end=None,
     g=0.5,
     lam=1.0,
+    rho=None,
 ):
     count = len(reward)
     column = lambda rows: torch.tensor([t in rows for t in range(count)])  # noqa: E731
@@ -38,6 +41,7 @@ def gae(
         column(truncated),
         gamma=g,
         gae_lambda=lam,
+        rho_T=None if rho is None else torch.tensor(rho),
     )
 
 
@@ -108,6 +112,83 @@ def test_staggering_does_not_change_what_is_learned():
     held = [x for v in value.tolist() for x in (v, 0.0)]
     sparse = gae(spread, held, valued=[True, False] * 10, final=2.0, lam=0.9)
     assert torch.allclose(sparse.advantage[::2], dense.advantage, atol=1e-6)
+
+
+def test_v_trace_by_hand():
+    # gamma .5: A_1 = 2 - .5, target .5 + .5*1.5 = 1.25; A_0 = 1 + .5*1.25 - .5 = 1.125
+    out = gae([1, 2], [0.5, 0.5], terminated=[1], rho=[1.0, 0.5])
+    assert out.advantage.tolist() == [1.125, 1.5]
+    assert out.target.tolist() == [1.625, 1.25]
+    # lambda .8 mixes in the value: 1 + .5*(.8*1.25 + .2*.5) - .5; a ratio of its own moves the target alone
+    out = gae([1, 2], [0.5, 0.5], terminated=[1], rho=[0.25, 0.5], lam=0.8)
+    assert out.advantage.tolist() == pytest.approx([1.05, 1.5])
+    assert out.target.tolist() == pytest.approx([0.5 + 0.25 * 1.05, 1.25])
+
+
+def test_v_trace_of_the_newest_policy_is_gae():
+    generator = torch.Generator().manual_seed(0)
+    reward, value = torch.randn(2, 20, generator=generator).tolist()
+    valued = (torch.rand(20, generator=generator) < 0.7).tolist()
+    case = {
+        "valued": valued,
+        "terminated": [4],
+        "truncated": [11],
+        "end": [1.5] * 20,
+        "final": 2.0,
+        "lam": 0.9,
+    }
+    plain, corrected = gae(reward, value, **case), gae(reward, value, **case, rho=[1.0] * 20)
+    assert torch.equal(plain.advantage, corrected.advantage) and torch.equal(plain.target, corrected.target)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_v_trace_is_the_sum_in_the_paper(seed):
+    rng = np.random.default_rng(seed)
+    rounds, slots, g, lam = 25, 6, 0.9, 0.8
+    reward, value, end, rho = rng.normal(size=(4, rounds, slots)).astype(np.float32)
+    rho = np.minimum(1, np.exp(rho))
+    final = rng.normal(size=slots).astype(np.float32)
+    valued, final_valued = rng.random((rounds, slots)) < 0.6, rng.random(slots) < 0.7
+    terminated, cut = rng.random((2, rounds, slots)) < 0.08
+    cut &= ~terminated
+    arrays = (reward, value, end, final, valued, final_valued, terminated, cut)
+    tensors = [torch.from_numpy(array) for array in arrays]
+    out = masked_gae(*tensors, gamma=g, gae_lambda=lam, rho_T=torch.from_numpy(rho))
+
+    count = 0
+    for slot in range(slots):
+        # each decision: reward up to the next or the end, the value there, and the decision that follows
+        chain = {}
+        for t in np.flatnonzero(valued[:, slot]):
+            total, bootstrap, following = 0.0, None, None
+            for u in range(t, rounds):
+                total += reward[u, slot]
+                if terminated[u, slot] or cut[u, slot]:
+                    bootstrap = end[u, slot] if cut[u, slot] else 0.0
+                    break
+                if u + 1 < rounds and valued[u + 1, slot]:
+                    bootstrap, following = value[u + 1, slot], u + 1
+                    break
+                if u + 1 == rounds and final_valued[slot]:
+                    bootstrap = final[slot]
+            if bootstrap is not None:
+                chain[t] = (rho[t, slot], total + g * bootstrap - value[t, slot], following)
+        assert sorted(chain) == np.flatnonzero(out.known[:, slot]).tolist()
+
+        # equation 1: the sum over t of gamma^(t-s) (c_s ... c_(t-1)) rho_t delta_t
+        moved = {}
+        for s in chain:
+            weight, at, moved[s] = 1.0, s, 0.0
+            while at in chain:
+                ratio, delta, following = chain[at]
+                moved[s] += weight * ratio * delta
+                weight, at = weight * g * lam * ratio, following
+        for s, (_, delta, following) in chain.items():
+            advantage = delta + g * lam * moved.get(following, 0.0)
+            assert out.target[s, slot].item() == pytest.approx(value[s, slot] + moved[s], abs=1e-4)
+            assert out.advantage[s, slot].item() == pytest.approx(advantage, abs=1e-4)
+            count += 1
+    assert count > 50
 
 
 def test_masked_statistics():

@@ -52,6 +52,13 @@ RUNS = {
     "DungeonEscape": (ROOM, 72),
     "workers": ([*BALL, "collect.workers=2", "collect.engine=local"], 96),
     "remembering": ([*ROOM, "model.memory=gru", "ppo.sequence_length=4"], 72),
+    "corrected": (
+        [
+            *(*ROOM, *BY_PART, "model.memory=gru", "ppo.sequence_length=4"),
+            *("ppo.objective=decoupled", "ppo.advantage=vtrace"),
+        ],
+        72,
+    ),
     "sensors": (
         [*SENSES, "model.goal_conditioning=hyper", "rewards.curiosity.strength=0.1", "collect.rounds=2"],
         128,

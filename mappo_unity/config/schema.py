@@ -100,6 +100,20 @@ class RatioKind(Enum):
     component = "component"
 
 
+class ObjectiveKind(Enum):
+    """What the probability ratio compares the policy with."""
+
+    clip = "clip"
+    decoupled = "decoupled"
+
+
+class AdvantageKind(Enum):
+    """How advantages and value targets are estimated."""
+
+    gae = "gae"
+    vtrace = "vtrace"
+
+
 class EntropyKind(Enum):
     """How the entropies of continuous columns become one."""
 
@@ -375,6 +389,9 @@ class PPOConfig:
     """Discount of a decision."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation."""
+    advantage: AdvantageKind = AdvantageKind.gae
+    """How advantages are estimated: as if the policy had collected the batch itself (gae), or corrected for
+    what an older one did (vtrace), see collect.overlap."""
     time_horizon: Optional[int] = None
     """Decisions of an agent after which its advantages are cut, and a value stands for the rest (as in
     ML-Agents); null: they are cut only where a batch ends."""
@@ -387,6 +404,10 @@ class PPOConfig:
     ratio: RatioKind = RatioKind.joint
     """The probability ratio that is clipped: of the whole action (joint), or of each continuous column and
     each branch by itself, averaged (component, as ML-Agents)."""
+    objective: ObjectiveKind = ObjectiveKind.clip
+    """What the ratio, its clipping and the KL limits compare the policy with: the one that collected the
+    batch (clip), or the one that the update began with, beside importance weights (decoupled), see
+    collect.overlap."""
     epochs: int = 3
     """Passes over a batch."""
     minibatch_size: int = 1024

@@ -82,6 +82,17 @@ class DecisionView:
         sums = np.take_along_axis(total, self.last + 1, 0) - total[:-1]
         return np.where(self.valued, np.where(is_one_round, reward, sums), 0).astype(np.float32)
 
+    def onward(self, values: np.ndarray, final: np.ndarray) -> np.ndarray:
+        """Return what stands ``[T, N]`` at the row that follows each row, read where known and not ends.
+
+        Args:
+            values: ``[T, N]``, read where valued.
+            final: ``[N]``, the same of the row after the last.
+        """
+        return np.take_along_axis(
+            np.concatenate([values, final[None]]), np.minimum(self.following, len(values)), 0
+        )
+
     def next_values(
         self, value: np.ndarray, final_value: np.ndarray, end_value: np.ndarray, truncated: np.ndarray
     ) -> np.ndarray:
@@ -93,19 +104,18 @@ class DecisionView:
             end_value: float32 ``[T, N]`` of terminal observations, read where truncated.
             truncated: bool ``[T, N]``, ends that were cut off: there the value goes on.
         """
-        rounds = len(value)
-        values = np.concatenate([value, final_value[None]])
-        onward = np.take_along_axis(values, np.minimum(self.following, rounds), 0)
+        onward = self.onward(value, final_value)
         at_end = np.take_along_axis(np.where(truncated, end_value, 0), self.last, 0)
         return np.where(self.known, np.where(self.ends, at_end, onward), 0)
 
-    def scan(self, delta: np.ndarray, decay: float, horizon: int | None = None) -> np.ndarray:
+    def scan(self, delta: np.ndarray, decay: float | np.ndarray, horizon: int | None = None) -> np.ndarray:
         """Run ``A_k = delta_k + decay * A_next`` from each slot's last row to its first.
 
         An end, and the row after the batch, have A = 0.
 
         Args:
             delta: float32 ``[T, N]``.
+            decay: one for all rows, or float32 ``[T, N]``.
             horizon: what comes after so many rows with a value, counted from the episode's first row in the
                 batch, counts as A = 0, too; None: nothing does.
 
@@ -113,7 +123,7 @@ class DecisionView:
             float32 ``[T, N]``, 0 where the outcome is not known.
         """
         delta = np.where(self.known, delta, 0).astype(np.float32)
-        factor = np.where(self.known & ~self.ends, np.float32(decay), np.float32(0))
+        factor = np.where(self.known & ~self.ends, np.asarray(decay, np.float32), np.float32(0))
         if horizon is not None:
             factor[self._place() % horizon == 0] = 0
         factor[~self.valued] = 1  # rounds without a value pass on what they got

@@ -10,6 +10,7 @@ from torchrl.data import ReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers import Sampler
 
 from mappo_unity.config.schema import PPOConfig
+from mappo_unity.learning.reduction import ALONE, Reduction
 
 
 class EvenSampler(Sampler):
@@ -21,10 +22,12 @@ class EvenSampler(Sampler):
     Args:
         decisions: int64 ``[R]``, decisions in each row.
         count: minibatches of an epoch.
+        fills_all: give each minibatch a row at least, that there are `count` of them in every epoch; else
+            where few rows hold most decisions there may be fewer.
     """
 
-    def __init__(self, decisions: Tensor, count: int) -> None:
-        self.decisions, self.count = decisions, count
+    def __init__(self, decisions: Tensor, count: int, fills_all: bool = False) -> None:
+        self.decisions, self.count, self._fills_all = decisions, count, fills_all
         # where all rows hold the same number, every order is cut at the same places
         self._is_even, self._sizes = bool((decisions == decisions[0]).all()), list[int]()
         self._parts: list[Tensor] = []
@@ -51,7 +54,14 @@ class EvenSampler(Sampler):
         # the middle of a row's decisions says which share it belongs to
         middle = total.double() - self.decisions[order].double() / 2
         share = (middle * self.count / total[-1]).long().clamp_(0, self.count - 1)
-        return torch.bincount(share, minlength=self.count).tolist()
+        sizes = torch.bincount(share, minlength=self.count)
+        if not self._fills_all:
+            return sizes.tolist()
+
+        # where each minibatch ends, less the row that it and each one before it has at least
+        number = torch.arange(1, self.count + 1, device=sizes.device)
+        spare = (sizes.cumsum(0) - number).clamp(0, len(order) - self.count).cummax(0).values
+        return (spare + number).diff(prepend=number.new_zeros(1)).tolist()
 
     @property
     def ran_out(self) -> bool:
@@ -79,16 +89,17 @@ class EvenSampler(Sampler):
         """Read nothing."""
 
 
-def make_buffer(rows: Any, decisions: Tensor, cfg: PPOConfig) -> ReplayBuffer:
+def make_buffer(rows: Any, decisions: Tensor, cfg: PPOConfig, reduction: Reduction = ALONE) -> ReplayBuffer:
     """Return a replay buffer over the rows of an update, from which an epoch draws each row once.
 
     Args:
         rows: TensorDict ``[R, ...]``, on the device of the networks.
         decisions: int64 ``[R]``, decisions in each row.
         cfg: `num_minibatches`, or `minibatch_size`.
+        reduction: of several learners, each of which has rows; a minibatch is then made of all their shares.
     """
-    count = minibatch_count(cfg, int(decisions.sum()), len(rows))
-    sampler = EvenSampler(decisions, count)
+    count = minibatch_count(cfg, reduction.total(int(decisions.sum())), reduction.least(len(rows)))
+    sampler = EvenSampler(decisions, count, fills_all=reduction.size > 1)
     # the rows themselves are the storage: nothing is copied in
     storage = TensorStorage(rows, device=decisions.device)
     return ReplayBuffer(storage=storage, sampler=sampler, batch_size=max(1, len(rows) // count))

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from mappo_unity import keys
 from mappo_unity.config.schema import Optimizer, PPOConfig
 from mappo_unity.learning.advantage import scheduled
+from mappo_unity.learning.reduction import ALONE, Reduction
 
 
 def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch.optim.Optimizer:
@@ -74,18 +75,20 @@ class CriticWarmup:
     Args:
         steps: agent decisions; 0: never.
         actor: what stands still until then, its normaliser too.
+        reduction: of several learners, whose decisions count together.
 
     Attributes: `decisions`, collected so far; `active`, whether the critic alone learns the newest batch.
     """
 
-    def __init__(self, steps: int, actor: nn.Module) -> None:
+    def __init__(self, steps: int, actor: nn.Module, reduction: Reduction = ALONE) -> None:
         self.steps, self.decisions, self.active = steps, 0, False
+        self._reduction = reduction
         self._still = set(actor.modules())
 
     def begin(self, batch: TensorDictBase) -> dict[str, float]:
         """Take note of a batch that is about to be learnt; return a metric, where there is a warm-up."""
         self.active = self.decisions < self.steps
-        self.decisions += int(batch.get(keys.ACTING).sum())
+        self.decisions += self._reduction.total(int(batch.get(keys.ACTING).sum()))
         return {"critic_warmup": float(self.active)} if self.steps else {}
 
     def total(self, losses: Mapping[str, Tensor]) -> Tensor:

@@ -9,33 +9,31 @@ import math
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from mappo_unity import keys
-from mappo_unity.config.schema import ObsNormUpdate, PPOConfig, RatioKind, ValueNormKind, ValueNormUpdate
+from mappo_unity.config.schema import (
+    AdvantageKind,
+    ObsNormUpdate,
+    PPOConfig,
+    RatioKind,
+    ValueNormKind,
+    ValueNormUpdate,
+)
 from mappo_unity.learning.advantage import (
-    Advantage,
     approximate_kl,
     estimate_streams,
     last_mean,
     make_view,
-    masked_mean,
-    normalize,
     scheduled,
     value_metrics,
 )
 from mappo_unity.learning.carried import VALUED, CarriedRounds, has_value
 from mappo_unity.learning.imitation.cloning import Cloning
-from mappo_unity.learning.loss import (
-    ACTOR_LEARNS,
-    BASELINE,
-    CRITIC_LEARNS,
-    MaskedClipPPOLoss,
-    move_with_minibatch,
-)
+from mappo_unity.learning.loss import ACTOR_LEARNS, MaskedClipPPOLoss, move_with_minibatch
 from mappo_unity.learning.minibatches import make_buffer
 from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
 from mappo_unity.learning.networks.encoders import running_norms, update_norms
@@ -48,10 +46,13 @@ from mappo_unity.learning.optimizer import (
     make_optimizer,
     set_learning_rates,
 )
+from mappo_unity.learning.proximal import enter_proximal, needs_proximal, stale_kl, truncated_ratio
+from mappo_unity.learning.reduction import ALONE, Reduction, check_reduced
 from mappo_unity.learning.rewards.streams import RewardStreams
 from mappo_unity.learning.rows import make_rows
-from mappo_unity.learning.value_norm import ValueNorm, by_stream, move_statistics
-from mappo_unity.learning.value_reader import ValueReader, Values
+from mappo_unity.learning.targets import enter_masks, enter_targets
+from mappo_unity.learning.value_norm import ValueNorm, by_stream
+from mappo_unity.learning.value_reader import ValueReader
 
 
 class PolicyLearner:
@@ -62,6 +63,8 @@ class PolicyLearner:
         cfg: the learner's options.
         rewards: the streams that the critic has values for; None: the environment's rewards alone.
         cloning: of demonstrations, beside PPO or alone; None: there are none.
+        reduction: of several learners, each of which learns from a part of a batch and has the same networks
+            and options; they begin with those of the first.
     """
 
     def __init__(
@@ -71,16 +74,19 @@ class PolicyLearner:
         cfg: PPOConfig,
         rewards: RewardStreams | None = None,
         cloning: Cloning | None = None,
+        reduction: Reduction = ALONE,
     ) -> None:
-        self.actor, self.critic, self.cfg = actor, critic, cfg
+        self.actor, self.critic, self.cfg, self.reduction = actor, critic, cfg, reduction
         self.rewards, self.cloning = rewards or RewardStreams(cfg), cloning
+        check_reduced(reduction, cfg, self.rewards.names, cloning is not None)
         actor.keeps_components = cfg.ratio is RatioKind.component
-        self.loss = MaskedClipPPOLoss(actor, critic, cfg)
+        self.loss = MaskedClipPPOLoss(actor, critic, cfg, reduction)
         self.optimizer = make_optimizer(actor, critic, cfg)
-        self.warmup = CriticWarmup(cfg.critic_warmup_steps, actor)
+        self.warmup = CriticWarmup(cfg.critic_warmup_steps, actor, reduction)
         self.params = [*actor.parameters(), *critic.parameters()]
+        reduction.share([*self.params, *actor.buffers(), *critic.buffers()])
         is_normalized = cfg.normalize_values is not ValueNormKind.none
-        self.value_norm = ValueNorm(cfg.value_norm_beta, is_normalized, len(self.rewards.names))
+        self.value_norm = ValueNorm(cfg.value_norm_beta, is_normalized, len(self.rewards.names), reduction)
         self.reader = ValueReader(critic, self.value_norm)
 
         inputs = [str(key) for net in (actor, critic) for key in net.in_keys]
@@ -116,7 +122,8 @@ class PolicyLearner:
         if self.cloning is not None:
             metrics |= self.cloning.learn(int(batch.get(keys.ACTING).sum()), settings["lr"], progress)
         if not self.actor.moving_norms:
-            update_norms(self.warmup.moving(self.norms), batch)  # after the update, which must not see it
+            # after the update, which must not see it
+            update_norms(self.warmup.moving(self.norms), batch, self.reduction)
         return metrics | settings
 
     def _set_schedules(self, progress: float) -> dict[str, float]:
@@ -139,7 +146,15 @@ class PolicyLearner:
 
         ended = rounds.get(keys.TERMINATED) | rounds.get(keys.TRUNCATED)
         view = make_view(rounds.get(VALUED), has_value(following.get(keys.FINAL)), ended)
+        self.carried.keep(rounds, view)  # without what is entered below
+        enter_masks(rounds, view)
+        for name, state in values.states.items():
+            rounds.set(name, state)
+
         rewards, metrics = self.rewards.rewards(rounds, following, view)
+        if needs_proximal(self.cfg):
+            enter_proximal(rounds, view, self.rows, self.loss)
+            metrics["stale_kl"] = stale_kl(rounds, self.reduction)
         gae = estimate_streams(
             view,
             rewards,
@@ -150,46 +165,17 @@ class PolicyLearner:
             gammas=self.rewards.gammas,
             gae_lambda=self.cfg.gae_lambda,
             horizon=self.cfg.time_horizon,
+            rho_T=truncated_ratio(rounds) if self.cfg.advantage is AdvantageKind.vtrace else None,
         )
-        self.carried.keep(rounds, view)
         self.reader.keep(values, rounds.get(VALUED) & ~gae.known)
 
-        learns = gae.known & rounds.get(keys.ACTING)
-        metrics |= value_metrics(self.rewards.names, values.value, gae.target, learns)
-        self._enter(rounds, values, gae, learns)
+        learns = rounds.get(ACTOR_LEARNS)
+        metrics |= value_metrics(self.rewards.names, values.value, gae.target, learns, self.reduction)
+        enter_targets(rounds, values, gae, self.value_norm, self.value_layers, self.cfg, self.reduction)
         rows, decisions = self.rows.of(rounds, view)
-        return (make_buffer(rows, decisions, self.cfg) if len(rows) else None), metrics
-
-    def _enter(self, rounds: TensorDict, values: Values, gae: Advantage, learns: Tensor) -> None:
-        """Set the entries that the loss reads beside inputs and actions."""
-        # values were denormalised, and are normalised below: the statistics move in between
-        by_minibatch = self.cfg.value_norm_update is ValueNormUpdate.minibatch
-        if not by_minibatch:
-            move_statistics(
-                self.value_norm,
-                gae.target[gae.known.squeeze(-1)],
-                self.value_layers if self.cfg.normalize_values is ValueNormKind.popart else (),
-            )
-
-        advantage = gae.advantage
-        if values.baseline is not None:
-            advantage = torch.where(gae.known, gae.target - values.baseline, 0.0)
-        if len(self.rewards.names) > 1:
-            advantage = advantage.sum(-1, keepdim=True)
-        if self.cfg.normalize_advantages:
-            advantage = normalize(advantage, learns)
-
-        # where the statistics move with each minibatch, it normalises these itself
-        scaled = (lambda x: x) if by_minibatch else self.value_norm.normalize
-        rounds.set(keys.ADVANTAGE, advantage)
-        rounds.set(keys.VALUE_TARGET, scaled(gae.target))
-        rounds.set(keys.VALUE, scaled(values.value))
-        if values.baseline is not None:
-            rounds.set(BASELINE, scaled(values.baseline))
-        for name, state in values.states.items():
-            rounds.set(name, state)
-        rounds.set(ACTOR_LEARNS, learns)
-        rounds.set(CRITIC_LEARNS, gae.known)
+        if not self.reduction.least(len(rows)):  # where one of several learners has none, all of them wait
+            return None, metrics
+        return make_buffer(rows, decisions, self.cfg, self.reduction), metrics
 
     def update(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Run the epochs; take everything back if a number is not finite or the KL explodes."""
@@ -207,7 +193,7 @@ class PolicyLearner:
                 steps += 1
 
             # one look at the KL an epoch: every look waits for the device
-            kl_epoch = float(torch.stack(kls).mean())
+            kl_epoch = float(self.reduction.whole(torch.stack(kls).mean()))
             if not math.isfinite(kl_epoch) or kl_epoch > self.cfg.max_kl:
                 break
             if self.cfg.target_kl is not None and kl_epoch > self.cfg.target_kl:
@@ -215,8 +201,10 @@ class PolicyLearner:
                 break
 
         # each step's KL is that before it: what the last one did is seen only now
-        kl_after = float(approximate_kl(*self.loss.compare(minibatch), minibatch.get(ACTOR_LEARNS, None)))
-        metrics = {name: float(value) / steps for name, value in sums.items()}
+        mask = minibatch.get(ACTOR_LEARNS, None)
+        kl = approximate_kl(*self.loss.compare(minibatch), mask, self.reduction)
+        kl_after = float(self.reduction.whole(kl))
+        metrics = {name: float(self.reduction.whole(value)) / steps for name, value in sums.items()}
         healthy = all(map(math.isfinite, (*metrics.values(), kl_after)))
         healthy = healthy and all(bool(torch.isfinite(p).all()) for p in self.params)
 
@@ -234,7 +222,7 @@ class PolicyLearner:
         }
 
     def step(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
-        """Take one step of the optimizer; return its terms, as they were before it."""
+        """Take one step of the optimizer; return its terms before it: of several learners, parts."""
         if self.cfg.value_norm_update is ValueNormUpdate.minibatch:
             move_with_minibatch(self.value_norm, minibatch)
         losses = self.loss(minibatch)
@@ -242,6 +230,7 @@ class PolicyLearner:
 
         self.optimizer.zero_grad()
         total.backward()
+        self.reduction.add_gradients(self.params)
         grad_norm = clip_gradients(self.optimizer, self.cfg)
         self.optimizer.step()
         for net in self.bounded:
@@ -253,10 +242,10 @@ class PolicyLearner:
             return {
                 "policy_loss": losses["loss_objective"].detach(),
                 "value_loss": losses["loss_critic"].detach(),
-                "entropy": masked_mean(self.loss.entropy, mask),
-                "kl": approximate_kl(self.loss.log_ratio, ratio, mask),
-                "clip_fraction": masked_mean(last_mean(clipped), mask),
-                "grad_norm": grad_norm.detach(),
+                "entropy": self.reduction.part(self.loss.entropy, mask),
+                "kl": approximate_kl(self.loss.log_ratio, ratio, mask, self.reduction),
+                "clip_fraction": self.reduction.part(last_mean(clipped), mask),
+                "grad_norm": grad_norm.detach() / self.reduction.size,
             }
 
     def _trainable_state(self) -> dict[str, Any]:

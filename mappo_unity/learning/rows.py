@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -10,12 +12,17 @@ from torch import Tensor
 from mappo_unity import keys
 from mappo_unity.config.schema import PPOConfig
 from mappo_unity.learning.decisions import DecisionView
-from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS, MEMBER, TEAM
+from mappo_unity.learning.loss import ACTOR_LEARNS, BASELINE, CRITIC_LEARNS, MEMBER, PROXIMAL, TEAM
 from mappo_unity.learning.networks.recurrent import RecurrentCritic
 from mappo_unity.learning.sequences import cut_sequences
 
-_LEARNT = (ACTOR_LEARNS, CRITIC_LEARNS, keys.ADVANTAGE, keys.VALUE_TARGET, keys.VALUE, BASELINE)
+_LEARNT = (ACTOR_LEARNS, CRITIC_LEARNS, PROXIMAL, keys.ADVANTAGE, keys.VALUE_TARGET, keys.VALUE, BASELINE)
+_PIECE = 4096  # decisions that are read at once: images of a whole batch would not fit into memory
 _ROUND, _TEAM_ROW, _VALID = "round", "team_row", "valid"
+
+
+Read = Callable[[TensorDictBase], Tensor]
+"""What the loss reads, as `take` returns it, to a number for each decision or several, ``[..., n]``."""
 
 
 class TeamRows:
@@ -43,6 +50,12 @@ class TeamRows:
         if bool((decisions == rows.shape[-1]).all()):
             rows = rows.exclude(ACTOR_LEARNS, CRITIC_LEARNS)
         return rows, decisions
+
+    def fill(self, rounds: TensorDict, view: DecisionView, key: str, read: Read) -> None:
+        """Set an entry ``[R, ..., A, n]`` of the rounds to what is read of their rows, piece by piece."""
+        rows = rounds.select(*self._keys).flatten(0, -2)
+        pieces = rows.split(max(1, _PIECE // rounds.shape[-1]))
+        rounds.set(key, torch.cat([read(piece) for piece in pieces]).view(*rounds.shape, -1))
 
     def take(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return what the loss reads."""
@@ -87,6 +100,21 @@ class SequenceRows:
         sequences = TensorDict(rows, rounds_at.shape[:1])
         own = self._own(ACTOR_LEARNS, sequences).squeeze(-1) & valid
         return sequences, own.sum(-1)
+
+    def fill(self, rounds: TensorDict, view: DecisionView, key: str, read: Read) -> None:
+        """Set an entry ``[R, ..., A, n]`` of the rounds to what is read of their sequences, piece by piece.
+
+        It is 0 where no sequence stands; there is one at least.
+        """
+        sequences, _ = self.of(rounds, view)
+        at, valid = sequences.get(_ROUND), sequences.get(_VALID)
+        pieces = sequences.split(max(1, _PIECE // at.shape[1]))
+        found = torch.cat([read(self.take(piece)) for piece in pieces])
+
+        slots = sequences.get(_TEAM_ROW) * rounds.shape[-1] + sequences.get(MEMBER)
+        flat = found.new_zeros(len(rounds), view.valued.shape[1], found.shape[-1])
+        flat[at[valid], slots.unsqueeze(-1).expand_as(at)[valid]] = found[valid]
+        rounds.set(key, flat.view(*rounds.shape, -1))
 
     def take(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return what the loss reads of these sequences: entries ``[B, L, ...]``, states ``[B, M]``."""

@@ -20,6 +20,7 @@ from mappo_unity.config.schema import ImageKind
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.attention import ENTITY_FEATURES, EntityEncoder
 from mappo_unity.learning.networks.images import IMAGE_FEATURES, ImageEncoder
+from mappo_unity.learning.reduction import ALONE, Reduction
 from mappo_unity.scenes.contract.images import FIRST, channel_dim, guessed_channel_dim
 from mappo_unity.scenes.contract.sensors import is_goal, is_set
 
@@ -149,15 +150,16 @@ class RunningNorm(nn.Module):
         return ((x - self.mean) * self.inv_std).clamp(-OBS_CLIP, OBS_CLIP)
 
     @torch.no_grad()
-    def update(self, rows: Tensor) -> None:
-        """Take ``rows`` ``[n, size]`` into the statistics (Chan et al., pairwise update)."""
-        if not len(rows):
+    def update(self, rows: Tensor, reduction: Reduction = ALONE) -> None:
+        """Take ``rows`` ``[n, size]`` of all learners into the statistics (Chan et al., pairwise update)."""
+        if not reduction.total(len(rows)):
             return
-        count = self.count + len(rows)
+        new, mean, new_var = reduction.moments(rows)
+        count = self.count + new
 
-        weight = float(len(rows) / count)
-        delta = rows.mean(0) - self.mean
-        var = self.var * (1 - weight) + rows.var(0, unbiased=False) * weight
+        weight = float(new / count)
+        delta = mean - self.mean
+        var = self.var * (1 - weight) + new_var * weight
 
         self.var.copy_(var + delta**2 * weight * (1 - weight))
         self.mean.add_(delta * weight)
@@ -170,12 +172,12 @@ def running_norms(net: nn.Module) -> list[RunningNorm]:
     return [part for part in net.modules() if isinstance(part, RunningNorm)]
 
 
-def update_norms(norms: Sequence[RunningNorm], entries: TensorDictBase) -> None:
+def update_norms(norms: Sequence[RunningNorm], entries: TensorDictBase, reduction: Reduction = ALONE) -> None:
     """Take the observations of who acts, in entries ``[..., A]`` of one policy name, into the statistics."""
     if norms:
         rows = entries.get(keys.OBS)[entries.get(keys.ACTING).squeeze(-1)]
         for norm in norms:
-            norm.update(rows)
+            norm.update(rows, reduction)
 
 
 class Encoder(nn.Module):
