@@ -11,7 +11,8 @@ at the decisions that the player had been asked for when it ended.
     python scripts/bench_peer.py --draw [--out outputs/peer]      # only the curves of what has been run
 
 A run that is over is kept, and not run again; OUT/results.csv has a row for each. The curves go to
-docs/benchmarks/peer.csv and peer.png (the picture needs matplotlib).
+docs/benchmarks/peer.csv, in the place of older ones of the same scenes, and peer.png (the picture needs
+matplotlib).
 """
 
 from __future__ import annotations
@@ -228,16 +229,36 @@ Curves = dict[tuple[str, str, int], list[tuple[int, float]]]
 
 
 def write_curves(out: Path, path: Path) -> Curves:
-    """Write the curves of all finished runs to a file and return them by scene, trainer and seed."""
-    curves = {
-        (row["scene"], row["trainer"], int(row["seed"])): curve(Path(row["folder"]), int(row["limit"]))
-        for row in results(out)
-    }
+    """Write the curves of all finished runs to a file and return them by scene, trainer and seed.
+
+    Curves of scenes that were not run stay as they stand in the file.
+    """
+    rows = results(out)
+    curves = {run_: points for run_, points in read_curves(path).items() if run_[0] not in scenes_of(rows)}
+    for row in rows:
+        run_ = row["scene"], row["trainer"], int(row["seed"])
+        curves[run_] = curve(Path(row["folder"]), int(row["limit"]))
     with open(path, "w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["scene", "trainer", "seed", "decisions", "mean_return"])
         for run_, points in curves.items():
             writer.writerows([*run_, at, f"{value:.4g}"] for at, value in points)
+    return curves
+
+
+def scenes_of(rows: list[dict[str, str]]) -> set[str]:
+    """Return the scenes of which there are results."""
+    return {row["scene"] for row in rows}
+
+
+def read_curves(path: Path) -> Curves:
+    """Return the curves that a file holds."""
+    curves: Curves = {}
+    if path.exists():
+        with open(path, newline="") as file:
+            for row in csv.DictReader(file):
+                points = curves.setdefault((row["scene"], row["trainer"], int(row["seed"])), [])
+                points.append((int(row["decisions"]), float(row["mean_return"])))
     return curves
 
 
