@@ -19,10 +19,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mappo_unity.config import effects
 from mappo_unity.config.behavior_lines import OPEN
+from mappo_unity.config.extras import SWEEP_EXTRA
 from mappo_unity.config.option_table import option_table
 from mappo_unity.config.options_file import file_root
 from mappo_unity.config.overrides import (
-    SWEEP_EXTRA,
     add_plus_prefix,
     check_overrides,
     check_value,

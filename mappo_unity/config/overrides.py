@@ -20,20 +20,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mappo_unity.config.behavior_lines import to_hydra_syntax
-from mappo_unity.config.extras import install_command
+from mappo_unity.config.extras import SWEEP_EXTRA, install_command
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table, show_value
 from mappo_unity.config.presets import describe_choices, hint_of_installed_scene
 from mappo_unity.config.schema import Config
 from mappo_unity.config.text_lines import LINE, parse_or_none, quoted_path
 from mappo_unity.errors import ConfigError
 
-SWEEP_EXTRA = {
-    "hydra/launcher=joblib": ("hydra_joblib_launcher", "sweep"),
-    "hydra/launcher=submitit_local": ("hydra_submitit_launcher", "slurm"),
-    "hydra/launcher=submitit_slurm": ("hydra_submitit_launcher", "slurm"),
-    "hydra/sweeper=optuna": ("hydra_optuna_sweeper", "sweep"),
-}
-"""Presets of conf/hydra that need a plugin: the plugin's package, and the extra that brings it."""
 LARGEST = 2**63 - 1
 """The largest whole number that files and tensors hold."""
 
