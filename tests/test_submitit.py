@@ -49,7 +49,7 @@ def test_without_slurm_a_sweep_is_refused(capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.mark.slow
 def test_a_job_that_is_started_again_goes_on_from_its_checkpoint() -> None:
-    lines = ["env=3DBall", "env.num_areas=2", "collect.rounds=64", *SMALL, "seed=0,1", "max_steps=12800"]
+    lines = ["env=3DBall", "env.num_areas=2", "collect.rounds=64", *SMALL, "seed=0,1", "max_steps=6400"]
     code = "import sys; from mappo_unity.cli import train_main; sys.exit(train_main(sys.argv[1:]))"
     sweep = subprocess.Popen([sys.executable, "-c", code, "-m", LOCAL, *lines])
     try:
@@ -63,7 +63,7 @@ def test_a_job_that_is_started_again_goes_on_from_its_checkpoint() -> None:
 
     rows = results(only_sweep())
     assert [row["status"] for row in rows] == ["finished", "finished"]
-    assert [row["iteration"] for row in read_metrics(metrics)] == [*range(1, 12800 // 128 + 1)]
+    assert [row["iteration"] for row in read_metrics(metrics)] == [*range(1, 6400 // 128 + 1)]
     said = [path.read_text() for path in only_sweep().rglob("*_log.out")]
     assert sorted(text.count("resuming from") for text in said) == [0, 1]
 

@@ -17,6 +17,14 @@ SWEEP_EXTRA = {
 }
 """Presets of conf/hydra that need a plugin: the plugin's package, and the extra that brings it."""
 
+SWEEP_EXTRA = {
+    "hydra/launcher=joblib": ("hydra_joblib_launcher", "sweep"),
+    "hydra/launcher=submitit_local": ("hydra_submitit_launcher", "slurm"),
+    "hydra/launcher=submitit_slurm": ("hydra_submitit_launcher", "slurm"),
+    "hydra/sweeper=optuna": ("hydra_optuna_sweeper", "sweep"),
+}
+"""Presets of conf/hydra that need a plugin: the plugin's package, and the extra that brings it."""
+
 
 def install_command(extra: str) -> str:
     """Return what installs an extra: scripts/setup for a clone's own .venv, pip elsewhere."""

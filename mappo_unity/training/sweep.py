@@ -31,6 +31,7 @@ from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.checkpoint_file import checkpoints_in, newest_good
 from mappo_unity.runs.folder import NewFolder, create_folder, discard_folder, write_record
 from mappo_unity.runs.lock import locked
 from mappo_unity.runs.progress import job_of_sweep
@@ -178,7 +179,6 @@ def _train(config: Config, folder: Path, result: JobResult) -> int | None:
     write_record(folder, config, result.overrides)
     check_factory(config.env)
     with interrupts_wait():
-        from mappo_unity.runs.checkpoint import checkpoints_in, newest_good
         from mappo_unity.training.trainer import train
 
     # the folder was new: what lies there is of this job, which its scheduler has started again

@@ -47,6 +47,8 @@ class Cluster:
             )
         _check_answers(address)
         own: dict[str, Any] = {"num_cpus": workers * WORKER_CPUS, "include_dashboard": False}
+        if address == "local":
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no reports from a run to Ray's makers
         with _handlers_kept():
             try:
                 ray.init(
