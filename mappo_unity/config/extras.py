@@ -9,13 +9,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 """Where the package lies: the top of a clone, or site-packages."""
-SWEEP_EXTRA = {
-    "hydra/launcher=joblib": ("hydra_joblib_launcher", "sweep"),
-    "hydra/launcher=submitit_local": ("hydra_submitit_launcher", "slurm"),
-    "hydra/launcher=submitit_slurm": ("hydra_submitit_launcher", "slurm"),
-    "hydra/sweeper=optuna": ("hydra_optuna_sweeper", "sweep"),
-}
-"""Presets of conf/hydra that need a plugin: the plugin's package, and the extra that brings it."""
 
 SWEEP_EXTRA = {
     "hydra/launcher=joblib": ("hydra_joblib_launcher", "sweep"),
