@@ -1,6 +1,7 @@
 """Self-play in workers: the driver decides who plays, workers play; resumed, replaced, refused."""
 
 import os
+import shutil
 import signal
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from mappo_unity.config.schema import CollectConfig, Engine, OpponentDraw
 from mappo_unity.keys import LEARNER
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.rng import seed_everything
+from mappo_unity.training.collection.fleet import weights_of
 from mappo_unity.training.collection.lineups import Lineup, Lineups, players_of_pairs, split_players
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.self_play.draw import LATEST
@@ -41,11 +43,14 @@ def in_workers(iterations=8, engine=Engine.local, overlap=False, **changes):
 class Run:
     """A run without logs: `iterate` collects, learns and draws; `batch` is the last one."""
 
-    def __init__(self, cfg, folder):
+    def __init__(self, cfg, folder, resumed=None):
+        self.folder = folder
         folder.mkdir(exist_ok=True)
         self.opened = set_up(cfg, folder)
         self.setup = self.opened.__enter__()
         self.state = RunState(cfg, folder, self.setup)
+        if resumed is not None:
+            self.state.load(resumed)
         self.collecting = self.setup.collecting()
         self.batches = self.collecting.__enter__()
         self.state.begin()
@@ -68,10 +73,8 @@ def players_of(batch):
 
 @pytest.fixture(scope="module")
 def processes(tmp_path_factory):
-    run = Run(
-        in_workers(engine=Engine.processes, play_against_latest_model_ratio=0.2),
-        tmp_path_factory.mktemp("run"),
-    )
+    cfg = in_workers(engine=Engine.processes, play_against_latest_model_ratio=0.2)
+    run = Run(cfg, tmp_path_factory.mktemp("run"))
     yield run
     run.close()
 
@@ -98,6 +101,32 @@ def test_processes_meet_whom_workers_in_this_process_meet(processes, tmp_path):
     assert_same(processes.state.self_play.state_dict(), local.state.self_play.state_dict())
     assert metrics[0]["Self-play/ELO"] != 1200.0 and metrics[0]["pool_size"] == 4
     local.close()
+
+
+def test_what_was_on_its_way_is_played_by_the_same_again_and_then_comes_who_was_drawn_behind_it(
+    processes, tmp_path
+):
+    self_play, fleet, policy = processes.state.self_play, processes.setup.fleet, processes.setup.policy
+    processes.iterate()
+    fleet.request(weights_of(policy), want_state=True)
+    self_play._draw()  # as at the end of an iteration, with overlap
+    assert fleet.opposing <= self_play._used()
+    checkpoint.save(tmp_path / "state.pt", processes.state.state_dict())
+
+    cfg = in_workers(play_against_latest_model_ratio=0.2)
+    cfg.collect.overlap = True
+    shutil.copytree(processes.folder, tmp_path / "run")
+    resumed = Run(cfg, tmp_path / "run", tmp_path / "state.pt")
+    seen = []
+    for is_on_its_way in (True, False):
+        if not is_on_its_way:
+            fleet.request(weights_of(policy), want_state=True)
+        resumed.setup.fleet.request(weights_of(policy), want_state=True)
+        batches = [each.receive() for each in (resumed.setup.fleet, fleet)]
+        assert_same(batches[0].rounds, batches[1].rounds)
+        seen.append(players_of(batches[0]))
+    assert not torch.equal(*seen)
+    resumed.close()
 
 
 @pytest.mark.slow
