@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_workers import LOCAL, SMALL, check_resume, children, wait_for
+from test_workers import LOCAL, SMALL, check_resume, children, options, wait_for
 from test_workers import SOCCER as TWO_AREAS
 
 from mappo_unity.cli import train_main
@@ -67,6 +67,27 @@ def test_an_address_where_no_cluster_answers_is_refused(
         assert train_main(["env=3DBall", "collect.workers=2", RAY, f"hydra.run.dir={tmp_path / 'run'}"]) == 2
         said = capsys.readouterr().err
         assert text in said and "Traceback" not in said
+
+
+class Unreadable:
+    """Cannot be unpickled."""
+
+    def __reduce__(self) -> Any:
+        return int, ("no number",)
+
+
+def test_an_actor_that_cannot_be_created_says_why(tmp_path: Path) -> None:
+    import ray
+
+    from mappo_unity.training.collection.on_ray.handle import ActorHandle
+    from mappo_unity.training.collection.worker_handle import WorkerLost
+
+    ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False)
+    number: Any = Unreadable()
+    with pytest.raises(WorkerLost) as loss:
+        ActorHandle(options(*SOCCER), number, tmp_path).receive()
+    assert str(loss.value).startswith("its actor cannot be created: ")
+    assert "ValueError: invalid literal for int() with base 10: 'no number'" in str(loss.value)
 
 
 def start(folder: Path, *lines: str) -> subprocess.Popen[bytes]:

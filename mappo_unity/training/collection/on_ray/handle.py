@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections import deque
 from concurrent.futures import Future, wait
@@ -132,6 +133,9 @@ def _is_done(answer: Future[Any], within_s: float) -> bool:
 
 def _reason(error: Exception) -> str:
     """Return the sentence that says why, of the many that Ray has."""
-    lines = str(error).splitlines() or [type(error).__name__]
+    text = re.sub("\x1b\\[[0-9;]*m", "", str(error))  # without colors
+    lines = [line.strip() for line in text.splitlines() if line.strip()] or [type(error).__name__]
+    if "creation task" in lines[0]:  # as where this package is missing there, or another version of it
+        return f"its actor cannot be created: {lines[-1]}"
     because = [line for line in lines if line.startswith("The actor is dead because")]
-    return (because or lines)[0].partition(". ")[0].strip().rstrip(".").replace("The actor", "the actor", 1)
+    return (because or lines)[0].partition(". ")[0].rstrip(".").replace("The actor", "the actor", 1)
