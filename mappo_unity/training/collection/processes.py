@@ -193,7 +193,7 @@ class RemoteWorkers(SeveralWorkers):
         process = self._open(number, self._restarts[number])
         try:
             _, description = process.receive()
-            if description.behaviors != self._parts[number].behaviors:
+            if description.behaviors != self.parts[number].behaviors:
                 raise ConfigError(
                     f"worker {number} was replaced, but its new environment shows other behaviors, sensors, "
                     "actions or team slots; env.max_teams and env.max_team_size give room for more agents"
@@ -213,7 +213,7 @@ class RemoteWorkers(SeveralWorkers):
 
     def _count_losses(self, batch: Batch, number: int) -> None:
         """Enter into a worker's batch how often it was replaced, and what that cost."""
-        part = self._parts[number]
+        part = self.parts[number]
         self._players[number] = batch.restarts or 0
         batch.restarts = self._restarts[number] + self._players_before[number] + self._players[number]
         if number not in self._lost:

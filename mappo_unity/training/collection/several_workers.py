@@ -42,7 +42,7 @@ class SeveralWorkers(Fleet):
     """
 
     def __init__(self, cfg: Config, parts: list[Description]) -> None:
-        self._cfg, self._parts, self.parts = cfg, parts, parts
+        self._cfg, self.parts = cfg, parts
         self.env: Description = join_descriptions(parts)
         self._weights: Weights | None = None  # of the batch that is requested, or was last
         self._is_requested = False
@@ -64,7 +64,7 @@ class SeveralWorkers(Fleet):
         """Wait for the batches, and join them, on the learners' device."""
         batches, self._states, rounds = self._answers()
         self._is_requested = False
-        return on_device(join_batches(batches, self._parts, rounds), self._cfg.device)
+        return on_device(join_batches(batches, self.parts, rounds), self._cfg.device)
 
     def oppose(self, lineup: Lineup) -> None:
         """Let opponents play teams from the next request on."""
@@ -78,12 +78,12 @@ class SeveralWorkers(Fleet):
     def set_parameter(self, name: str, value: Value) -> None:
         """Set an environment parameter everywhere."""
         self._call("set_parameter", name, value)
-        self._states = [None] * len(self._parts)
+        self._states = [None] * len(self.parts)
 
     def restart(self) -> None:
         """Reset all scenes."""
         self._call("restart")
-        self._states = [None] * len(self._parts)
+        self._states = [None] * len(self.parts)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the workers' states; `behind`: the weights of a batch on its way, to collect it again."""
@@ -96,7 +96,7 @@ class SeveralWorkers(Fleet):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore them."""
         self._load(state["workers"])
-        self._states = [None] * len(self._parts)
+        self._states = [None] * len(self.parts)
         if self._cfg.collect.overlap:
             self._behind = state["behind"]
             self._lineups.load_state_dict(state.get("behind_players"))

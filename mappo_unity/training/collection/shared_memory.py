@@ -59,7 +59,7 @@ class WorkerProcesses(RemoteWorkers):
             if capacity < length:
                 # smaller memory stays: others may write to it
                 capacity = ROOM * length
-                layout = make_layout(rows, self._parts, capacity)
+                layout = make_layout(rows, self.parts, capacity)
                 slabs[capacity] = layout, SharedBytes(layout.size)
             layout, block = slabs[capacity]
             self.processes[number].send(SLAB, block.path, layout)
