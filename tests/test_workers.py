@@ -227,7 +227,7 @@ def set_up_alone(setup: TrainingSetup, worker: int) -> Any:
     from mappo_unity.training.learners import make_learners
 
     fleet: Any = setup.fleet
-    (alone,) = make_learners(setup.cfg, fleet._parts[worker], 60, lambda note: None).values()
+    (alone,) = make_learners(setup.cfg, fleet.parts[worker], 60, lambda note: None).values()
     (learner,) = setup.learners.values()
     alone.load_state_dict(learner.state_dict())
     return alone
