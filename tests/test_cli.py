@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -76,12 +75,11 @@ def new_run() -> Path:
 
 @pytest.mark.parametrize("command", ["train_main", "eval_main"])
 def test_help_comes_at_once_without_torch(command: str) -> None:
-    check = "assert 'torch' not in sys.modules"
+    # these take seconds to import
+    check = "assert not {'torch', 'torchrl', 'mujoco', 'mlagents_envs'} & set(sys.modules)"
     code = f"import sys; from mappo_unity.cli import {command} as m; m(['-h']); {check}"
-    start_s = time.monotonic()
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert time.monotonic() - start_s < 2
     table = option_table(Config if command == "train_main" else EvalConfig)
     for key, option in table.items():
         assert (f"{key}.*" if option.is_section else f"{key}: ") in done.stdout
