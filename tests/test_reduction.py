@@ -52,9 +52,9 @@ class InThreads(SeveralLearners):
 
     def _everybodys(self, tensor: Tensor) -> list[Tensor]:
         self._table[self._rank] = tensor.detach().clone()
-        self._barrier.wait(30)
+        self._barrier.wait(120)
         found = list(self._table)
-        self._barrier.wait(30)
+        self._barrier.wait(120)
         assert all(each.shape == tensor.shape for each in found)  # the same call of everybody
         return found
 

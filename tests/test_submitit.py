@@ -30,7 +30,7 @@ def _here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_jobs_of_submitit_have_folders_and_a_table(tmp_path: Path) -> None:
     process = start_with_fake_training(tmp_path, LOCAL, "seed=0,13")
-    output, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=300)
     assert process.returncode == 1, errors
     rows = results(only_sweep())
     assert [(row["seed"], row["status"]) for row in rows] == [("0", "finished"), ("13", "failed")]

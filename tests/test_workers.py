@@ -369,7 +369,7 @@ def children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def wait_for(condition: Any, within_s: float = 120.0) -> None:
+def wait_for(condition: Any, within_s: float = 300.0) -> None:
     until = time.monotonic() + within_s
     while not condition():
         assert time.monotonic() < until, "it took too long"
