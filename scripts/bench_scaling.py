@@ -34,7 +34,7 @@ VARIANTS = (
     ("2, overlap", ["collect.workers=2", "collect.overlap=true"]),
 )
 QUIET = ["log.loggers=[]", "log.progress=false", "export_onnx=false"]
-ENDLESS = ["max_steps=1000000000", "checkpoint_interval=1000000000", "matches.interval=1000000000"]
+ENDLESS = ["max_steps=1000000000", "checkpoint_interval=1000000000", "matches.interval=null"]
 
 
 def main() -> None:
