@@ -30,7 +30,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from learn_scene import append
+from learn_scene import append, results
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAINERS = "mlagents-learn", "mappo-unity"
@@ -214,15 +214,6 @@ def curve(folder: Path, limit: int) -> list[tuple[int, float]]:
         if at < limit:
             bins[int(at / width)].append(value)
     return [(round((i + 1) * width), statistics.mean(values)) for i, values in enumerate(bins) if values]
-
-
-def results(out: Path) -> list[dict[str, str]]:
-    """Return the rows of OUT/results.csv."""
-    path = out / "results.csv"
-    if not path.exists():
-        return []
-    with open(path) as file:
-        return list(csv.DictReader(file))
 
 
 Curves = dict[tuple[str, str, int], list[tuple[int, float]]]

@@ -13,7 +13,6 @@ again; each result is printed and appended to OUT/results.csv, and a table is pr
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import shutil
@@ -24,7 +23,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from learn_scene import append, mappo_eval
+from learn_scene import append, mappo_eval, results
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAIN = "import sys; from mappo_unity.cli import train_main; sys.exit(train_main())"
@@ -49,11 +48,11 @@ def main() -> None:
         for seed in arguments.seeds:
             for version, checkout in (("before", arguments.before.resolve()), ("now", ROOT)):
                 folder = out / f"{scene}-{version}-{seed}"
-                if str(folder) not in [row["folder"] for row in read(out)]:
+                if str(folder) not in [row["folder"] for row in results(out)]:
                     row = run(scene, seed, arguments, checkout, folder)
                     append(out / "results.csv", {"version": version} | row)
                     print(version, row, flush=True)
-    print(table(read(out)))
+    print(table(results(out)))
 
 
 def run(scene: str, seed: int, arguments: argparse.Namespace, checkout: Path, folder: Path) -> dict[str, Any]:
@@ -100,15 +99,6 @@ def score(scene: str, episodes: int, folder: Path) -> dict[str, Any]:
         for name, own in said["as"].items()
     }
     return {"score": round(said["goal_difference"], 3), "details": json.dumps(sides)}
-
-
-def read(out: Path) -> list[dict[str, str]]:
-    """Return the rows of OUT/results.csv."""
-    path = out / "results.csv"
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def table(rows: list[dict[str, str]]) -> str:

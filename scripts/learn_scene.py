@@ -79,6 +79,15 @@ def mappo_eval(*options: str) -> dict[str, Any]:
     return said
 
 
+def results(out: Path) -> list[dict[str, str]]:
+    """Return the rows of OUT/results.csv."""
+    path = out / "results.csv"
+    if not path.exists():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def append(path: Path, row: dict[str, object]) -> None:
     """Append a row to a CSV file, which gets a head if it is new."""
     is_new = not path.exists()

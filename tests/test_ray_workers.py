@@ -16,6 +16,7 @@ from test_workers import (
     SOCCER,
     assert_same_batch,
     options,
+    replaced_hanging,
     wait_for,
 )
 
@@ -131,15 +132,8 @@ def test_two_actors_that_are_killed_are_replaced(actors: TrainingSetup) -> None:
 
 @pytest.mark.slow
 def test_an_actor_that_hangs_is_replaced(actors: TrainingSetup) -> None:
-    fleet = fleet_of(actors)
-    hangs = fleet.processes[1]
-    os.kill(hangs.pid, signal.SIGSTOP)
-    hangs.timeout_s = 0.2
-    fleet.request(weights_of(actors.policy), want_state=True)
-    batch = fleet.receive()
-    assert fleet.processes[1] is not hangs and batch.dropped_episodes == 4
-    assert batch.count_decisions("SoccerTwos") == 12 * 8
-    wait_for(lambda: not Path(f"/proc/{hangs.pid}").exists())
+    hung = replaced_hanging(actors)
+    wait_for(lambda: not Path(f"/proc/{hung}").exists())
 
 
 def test_too_many_losses_end_the_run(actors: TrainingSetup, monkeypatch: pytest.MonkeyPatch) -> None:

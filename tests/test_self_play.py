@@ -248,18 +248,24 @@ def test_elo_moves_as_in_ml_agents(tmp_path):
     assert metrics["Self-play/ELO"] == self_play.elo["Rps"] and metrics["points_vs_pool"] == 0.0
 
 
+def check_resume(cfg, folder):
+    """Compare a run with one in two parts, to the bit; return its last checkpoint."""
+    whole = train(cfg, folder / "whole")
+    train(cfg, folder / "parts", after_iteration=lambda s: "interrupted" if s.iteration == 4 else None)
+    path, _ = checkpoint.newest_good(folder / "parts")
+    resumed = train(cfg, folder / "parts", path)
+
+    assert rows(folder / "whole") == rows(folder / "parts")
+    first, second = (checkpoint.load(o.last_checkpoint) for o in (whole, resumed))
+    assert_same(without_times(first), without_times(second))
+    return first
+
+
 @pytest.mark.parametrize("changes", [{}, {"team_change": 200, "opponents": OpponentDraw.hardest}])
 def test_a_run_with_a_pool_resumes_to_the_bit(tmp_path, changes):
     cfg = matrix_game(8, matches=MatchConfig(interval=128, count=4))
     cfg = replace(cfg, self_play=replace(cfg.self_play, fixed=["random"], **changes))
-    whole = train(cfg, tmp_path / "whole")
-    train(cfg, tmp_path / "parts", after_iteration=lambda s: "interrupted" if s.iteration == 4 else None)
-    path, _ = checkpoint.newest_good(tmp_path / "parts")
-    resumed = train(cfg, tmp_path / "parts", path)
-
-    assert rows(tmp_path / "whole") == rows(tmp_path / "parts")
-    first, second = (checkpoint.load(o.last_checkpoint) for o in (whole, resumed))
-    assert_same(without_times(first), without_times(second))
+    check_resume(cfg, tmp_path)
     files = [sorted(p.name for p in (tmp_path / run / "pool").iterdir()) for run in ("whole", "parts")]
     assert files[0] == files[1] and len(files[0]) <= 3 + 5 + 1  # the window, and what kept checkpoints name
 

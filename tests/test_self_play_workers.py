@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from test_self_play import GAME, GAMES, matrix_game
-from test_train import rows, without_times
+from test_self_play import GAME, GAMES, check_resume, matrix_game
 from test_workers import assert_same, fleet_of
 
 from mappo_unity import keys
@@ -23,7 +22,6 @@ from mappo_unity.training.collection.lineups import Lineup, Lineups, players_of_
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.self_play.draw import LATEST
 from mappo_unity.training.setup import set_up
-from mappo_unity.training.trainer import train
 
 WORKERS = 2
 
@@ -149,14 +147,7 @@ OVERLAP = pytest.param({"overlap": True, "engine": Engine.processes}, marks=pyte
 @pytest.mark.parametrize("changes", [{}, {"team_change": 300, "opponents": OpponentDraw.hardest}, OVERLAP])
 def test_a_resumed_run_meets_whom_it_would_have_met(tmp_path, changes):
     cfg = in_workers(play_against_latest_model_ratio=0.2, **changes)
-    whole = train(cfg, tmp_path / "whole")
-    train(cfg, tmp_path / "parts", after_iteration=lambda s: "interrupted" if s.iteration == 4 else None)
-    path, _ = checkpoint.newest_good(tmp_path / "parts")
-    resumed = train(cfg, tmp_path / "parts", path)
-
-    assert rows(tmp_path / "whole") == rows(tmp_path / "parts")
-    first, second = (checkpoint.load(o.last_checkpoint) for o in (whole, resumed))
-    assert_same(without_times(second), without_times(first))
+    first = check_resume(cfg, tmp_path)
     assert first["iteration"] > 6 and first["self_play"]["draws"] > 4
     assert (first["workers"][1]["opponents"]["playing"]["Rps"] != LEARNER).any()
 

@@ -88,9 +88,7 @@ def assert_same(a, b, where="state"):
         for index, (x, y) in enumerate(zip(a, b)):
             assert_same(x, y, f"{where}[{index}]")
     elif isinstance(a, torch.Tensor):
-        assert torch.equal(a.nan_to_num(), b.nan_to_num()) if a.is_floating_point() else torch.equal(a, b), (
-            where
-        )
+        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True, msg=where)
     else:
         assert a == b or (a != a and b != b), where
 

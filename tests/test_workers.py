@@ -26,6 +26,7 @@ from mappo_unity.runs import checkpoint
 from mappo_unity.scenes.contract.rules import EnvironmentDataError
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.fleet import weights_of
+from mappo_unity.training.collection.processes import RemoteWorkers
 from mappo_unity.training.collection.several_workers import LocalWorkers
 from mappo_unity.training.collection.shared_memory import WorkerProcesses
 from mappo_unity.training.collection.worker import Worker
@@ -155,16 +156,25 @@ def test_a_worker_that_is_killed_is_replaced(processes: TrainingSetup) -> None:
 
 @pytest.mark.slow
 def test_a_worker_that_hangs_is_replaced(processes: TrainingSetup) -> None:
-    fleet = fleet_of(processes)
+    hung = replaced_hanging(processes)
+    with pytest.raises(ProcessLookupError):
+        os.kill(hung, 0)
+
+
+def replaced_hanging(setup: TrainingSetup) -> int:
+    """Let a worker hang until another stands in its place, and return its process's id."""
+    fleet = setup.fleet
+    assert isinstance(fleet, RemoteWorkers)
     hangs = fleet.processes[1]
-    os.kill(hangs.pid, signal.SIGSTOP)
+    pid = hangs.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
     hangs.timeout_s = 0.2
-    fleet.request(weights_of(processes.policy), want_state=True)
+    fleet.request(weights_of(setup.policy), want_state=True)
     batch = fleet.receive()
     assert fleet.processes[1] is not hangs and batch.dropped_episodes == 4
     assert batch.count_decisions("SoccerTwos") == 12 * 8
-    with pytest.raises(ProcessLookupError):
-        os.kill(hangs.pid, 0)
+    return pid
 
 
 def test_too_many_losses_end_the_run(processes: TrainingSetup, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,6 +46,7 @@ class Cluster:
                 f"{ADDRESS}=auto, or give the address of its head node: {ADDRESS}=HOST:6379"
             )
         _check_answers(address)
+
         own: dict[str, Any] = {"num_cpus": workers * WORKER_CPUS, "include_dashboard": False}
         if address == "local":
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no reports from a run to Ray's makers
