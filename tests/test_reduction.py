@@ -97,7 +97,9 @@ def side_by_side(work: Callable[[int, Reduction], Any]) -> list[Any]:
 def joined(learner: PolicyLearner, reduction: Reduction) -> PolicyLearner:
     """Return a learner with copies of another's networks and options that learns beside others."""
     actor, critic = copy.deepcopy(learner.actor), copy.deepcopy(learner.critic)
-    return PolicyLearner(actor, critic, learner.cfg, reduction=reduction)
+    mine = PolicyLearner(actor, critic, learner.cfg)
+    mine.join(reduction)
+    return mine
 
 
 def assert_alike(learners: list[PolicyLearner], one: PolicyLearner) -> None:

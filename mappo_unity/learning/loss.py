@@ -47,15 +47,13 @@ class MaskedClipPPOLoss(ClipPPOLoss):
     Args:
         actor, critic: see `learning.networks.actor_critic`.
         cfg: the learner's options.
-        reduction: of several learners; losses are then this one's part.
 
-    Attributes: `log_ratio` and `ratio` ``[..., n]`` and `entropy` ``[..., 1]`` of the last call, without
-    gradients; n is 1, or with ``ppo.ratio=component`` the components of an action.
+    Attributes: `reduction`, of several learners; losses are then this one's part; `log_ratio` and `ratio`
+    ``[..., n]`` and `entropy` ``[..., 1]`` of the last call, without gradients; n is 1, or with
+    ``ppo.ratio=component`` the components of an action.
     """
 
-    def __init__(
-        self, actor: UnityActor, critic: TensorDictModule, cfg: PPOConfig, reduction: Reduction = ALONE
-    ) -> None:
+    def __init__(self, actor: UnityActor, critic: TensorDictModule, cfg: PPOConfig) -> None:
         super().__init__(
             actor,
             critic,
@@ -65,7 +63,8 @@ class MaskedClipPPOLoss(ClipPPOLoss):
             normalize_advantage=False,
             functional=False,
         )
-        self.cfg, self._reduction = cfg, reduction
+        self.cfg = cfg
+        self.reduction: Reduction = ALONE
         self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
         self._actor, self._critic = actor, critic.module
         self.critic_keys = [str(key) for key in critic.in_keys]
@@ -88,7 +87,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         entropy = dist.entropy(mean=self.cfg.entropy is EntropyKind.mean).unsqueeze(-1)
         self.entropy = entropy.detach()
 
-        part = self._reduction.part
+        part = self.reduction.part
         return {
             "loss_objective": -part(last_mean(gain), mask),
             "loss_critic": self.cfg.value_coef * self._critic_loss(rows, clip),
@@ -142,13 +141,13 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         value, baseline = self._values(rows)
 
         loss = self._distance(value, target, rows.get(keys.VALUE) if self.cfg.clip_value else None, clip)
-        loss = self._reduction.part(loss, mask)
+        loss = self.reduction.part(loss, mask)
         if baseline is None:
             return loss
 
         # ML-Agents clips the baseline's move, and not the value's
         beside = self._distance(baseline, target, rows.get(BASELINE), clip)
-        return loss + BASELINE_WEIGHT * self._reduction.part(beside, rows.get(ACTOR_LEARNS, None))
+        return loss + BASELINE_WEIGHT * self.reduction.part(beside, rows.get(ACTOR_LEARNS, None))
 
     def _values(self, rows: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         """Return values, and baselines where the critic has them."""

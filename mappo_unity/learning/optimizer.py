@@ -75,20 +75,20 @@ class CriticWarmup:
     Args:
         steps: agent decisions; 0: never.
         actor: what stands still until then, its normaliser too.
-        reduction: of several learners, whose decisions count together.
 
-    Attributes: `decisions`, collected so far; `active`, whether the critic alone learns the newest batch.
+    Attributes: `decisions`, collected so far; `active`, whether the critic alone learns the newest batch;
+    `reduction`, of several learners, whose decisions count together.
     """
 
-    def __init__(self, steps: int, actor: nn.Module, reduction: Reduction = ALONE) -> None:
+    def __init__(self, steps: int, actor: nn.Module) -> None:
         self.steps, self.decisions, self.active = steps, 0, False
-        self._reduction = reduction
+        self.reduction: Reduction = ALONE
         self._still = set(actor.modules())
 
     def begin(self, batch: TensorDictBase) -> dict[str, float]:
         """Take note of a batch that is about to be learnt; return a metric, where there is a warm-up."""
         self.active = self.decisions < self.steps
-        self.decisions += self._reduction.total(int(batch.get(keys.ACTING).sum()))
+        self.decisions += self.reduction.total(int(batch.get(keys.ACTING).sum()))
         return {"critic_warmup": float(self.active)} if self.steps else {}
 
     def total(self, losses: Mapping[str, Tensor]) -> Tensor:

@@ -63,8 +63,6 @@ class PolicyLearner:
         cfg: the learner's options.
         rewards: the streams that the critic has values for; None: the environment's rewards alone.
         cloning: of demonstrations, beside PPO or alone; None: there are none.
-        reduction: of several learners, each of which learns from a part of a batch and has the same networks
-            and options; they begin with those of the first.
     """
 
     def __init__(
@@ -74,19 +72,17 @@ class PolicyLearner:
         cfg: PPOConfig,
         rewards: RewardStreams | None = None,
         cloning: Cloning | None = None,
-        reduction: Reduction = ALONE,
     ) -> None:
-        self.actor, self.critic, self.cfg, self.reduction = actor, critic, cfg, reduction
+        self.actor, self.critic, self.cfg = actor, critic, cfg
+        self.reduction: Reduction = ALONE
         self.rewards, self.cloning = rewards or RewardStreams(cfg), cloning
-        check_reduced(reduction, cfg, self.rewards.names, cloning is not None)
         actor.keeps_components = cfg.ratio is RatioKind.component
-        self.loss = MaskedClipPPOLoss(actor, critic, cfg, reduction)
+        self.loss = MaskedClipPPOLoss(actor, critic, cfg)
         self.optimizer = make_optimizer(actor, critic, cfg)
-        self.warmup = CriticWarmup(cfg.critic_warmup_steps, actor, reduction)
+        self.warmup = CriticWarmup(cfg.critic_warmup_steps, actor)
         self.params = [*actor.parameters(), *critic.parameters()]
-        reduction.share([*self.params, *actor.buffers(), *critic.buffers()])
         is_normalized = cfg.normalize_values is not ValueNormKind.none
-        self.value_norm = ValueNorm(cfg.value_norm_beta, is_normalized, len(self.rewards.names), reduction)
+        self.value_norm = ValueNorm(cfg.value_norm_beta, is_normalized, len(self.rewards.names))
         self.reader = ValueReader(critic, self.value_norm)
 
         inputs = [str(key) for net in (actor, critic) for key in net.in_keys]
@@ -101,6 +97,19 @@ class PolicyLearner:
         self.norms = [*running_norms(actor), *running_norms(critic)]
         actor.moving_norms = running_norms(actor) if cfg.obs_norm_update is ObsNormUpdate.round else []
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
+
+    def check_joins(self, size: int) -> None:
+        """Raise ConfigError where what is learnt cannot be learnt by `size` learners side by side."""
+        check_reduced(size, self.cfg, self.rewards.names, self.cloning is not None)
+
+    def join(self, reduction: Reduction) -> None:
+        """Learn beside others from now on, each from a part of a batch; begin with the networks of the first.
+
+        All have the same options, and what else is in their states but the slots' own.
+        """
+        self.check_joins(reduction.size)
+        self.reduction = self.loss.reduction = self.warmup.reduction = self.value_norm.reduction = reduction
+        reduction.share([*self.params, *self.actor.buffers(), *self.critic.buffers()])
 
     def learn(self, batch: TensorDictBase, following: TensorDictBase, progress: float) -> dict[str, float]:
         """Improve the networks by one batch; return metrics.

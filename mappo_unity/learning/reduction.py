@@ -137,21 +137,21 @@ class SeveralLearners(Reduction):
         dist.broadcast(tensor, group=self._group, group_src=0)
 
 
-def check_reduced(reduction: Reduction, cfg: PPOConfig, streams: Sequence[str], clones: bool) -> None:
+def check_reduced(size: int, cfg: PPOConfig, streams: Sequence[str], clones: bool) -> None:
     """Raise ConfigError for what several learners do not add up.
 
     Args:
-        reduction: how many there are.
+        size: how many there are.
         cfg: the learner's options.
         streams: names of the reward streams, the environment's own first.
         clones: whether demonstrations are cloned.
     """
-    if reduction.size == 1:
+    if size == 1:
         return
     given = [f"rewards.{name}" for name in streams[1:]] + ["bc.demos"] * clones
     given += ["ppo.obs_norm_update=round"] * (cfg.obs_norm_update is ObsNormUpdate.round)
     if given:
         raise ConfigError(
-            f"{given[0]} does not go with {reduction.size} learners: each would learn it by itself; leave it "
+            f"{given[0]} does not go with {size} learners: each would learn it by itself; leave it "
             "out, or let one learn alone"
         )

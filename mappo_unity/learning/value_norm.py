@@ -24,18 +24,18 @@ class ValueNorm(nn.Module):
         beta: decay of the averages for each update.
         enabled: False makes it the identity.
         streams: V, reward streams that have a value each.
-        reduction: of several learners, whose returns are taken together.
+
+    Attributes: `reduction`, of several learners, whose returns are taken together.
     """
 
     mean: Tensor
     mean_sq: Tensor
     debias: Tensor
 
-    def __init__(
-        self, beta: float, enabled: bool = True, streams: int = 1, reduction: Reduction = ALONE
-    ) -> None:
+    def __init__(self, beta: float, enabled: bool = True, streams: int = 1) -> None:
         super().__init__()
-        self.beta, self.enabled, self._reduction = beta, enabled, reduction
+        self.beta, self.enabled = beta, enabled
+        self.reduction: Reduction = ALONE
         self.register_buffer("mean", torch.zeros(streams, dtype=torch.float64))
         self.register_buffer("mean_sq", torch.zeros(streams, dtype=torch.float64))
         self.register_buffer("debias", torch.zeros((), dtype=torch.float64))
@@ -43,14 +43,14 @@ class ValueNorm(nn.Module):
     @torch.no_grad()
     def update(self, returns: Tensor) -> None:
         """Take returns ``[n, V]`` into the averages."""
-        if not self.enabled or not self._reduction.total(returns.numel()):
+        if not self.enabled or not self.reduction.total(returns.numel()):
             return
 
         # in float64: a difference of two averages of squares loses digits
         columns = [column.contiguous() for column in returns.double().unbind(-1)]
         for average, moments in (
-            (self.mean, [self._reduction.mean(column, None) for column in columns]),
-            (self.mean_sq, [self._reduction.mean(column**2, None) for column in columns]),
+            (self.mean, [self.reduction.mean(column, None) for column in columns]),
+            (self.mean_sq, [self.reduction.mean(column**2, None) for column in columns]),
         ):
             average.mul_(self.beta).add_(torch.stack(moments).to(average) * (1 - self.beta))
         self.debias.mul_(self.beta).add_(1 - self.beta)

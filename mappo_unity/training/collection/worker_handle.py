@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import pickle
-import signal
-import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import torch
 
 from mappo_unity.config.schema import Config
+from mappo_unity.training.child_process import start_child
 from mappo_unity.training.collection.slab import SharedBytes
 from mappo_unity.training.collection.worker_process import (
     CLOSE,
@@ -103,14 +99,8 @@ class WorkerProcess(WorkerHandle):
         self._shared = SharedBytes(PULSE_BYTES)
         self._pulse = self._shared.bytes.view(torch.int64)
 
-        # "spawn": a copy of a process in which torch has run may hang
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        arguments = (cfg, number, folder, restarts, self._shared.path, theirs)
-        self._process = context.Process(target=main, args=arguments, name=f"worker-{number}")
-        with _interrupts_blocked(), _without_main():
-            self._process.start()
-        theirs.close()
+        arguments = (cfg, number, folder, restarts, self._shared.path)
+        self._process, self._pipe = start_child(main, arguments, f"worker-{number}")
 
     @property
     def pid(self) -> int | None:
@@ -161,27 +151,3 @@ class WorkerProcess(WorkerHandle):
         self._process.join(END_S)
         code = self._process.exitcode
         return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Let a process that is started here begin with SIGINT blocked, until it can take it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _without_main() -> Iterator[None]:
-    """Let a process that is started here not import the program: a script would begin to train there, too."""
-    before = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = before

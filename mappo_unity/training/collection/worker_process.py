@@ -8,18 +8,13 @@ memory that it knows, or (`ERROR`, `Report`). Tensors of a batch travel in share
 
 from __future__ import annotations
 
-import ctypes
 import os
 import pickle
-import signal
-import sys
-import threading
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from multiprocessing import parent_process
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +26,7 @@ from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.runs.rng import seed_everything
+from mappo_unity.training.child_process import begin_child
 from mappo_unity.training.collection.slab import Layout, open_bytes, rows_of, write
 from mappo_unity.training.collection.worker import Worker, make_worker, worker_config
 
@@ -40,8 +36,6 @@ OK, SPACE, ERROR = "ok", "space", "error"
 ROUNDS, STOP = 0, 1
 """Of a pulse, int64 ``[2]``: the rounds that the worker has played, and whether it is to stop."""
 PULSE_BYTES = 16
-
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class Report(NamedTuple):
@@ -103,13 +97,7 @@ def main(cfg: Config, number: int, folder: Path, restarts: int, pulse: str, pipe
         pulse: path of the shared bytes of its pulse.
         pipe: to the driver.
     """
-    _follow_parent()
-    # the driver's business; not SIG_IGN, which players would inherit
-    for signal_number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signal_number, lambda number, frame: None)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-
+    begin_child()
     torch.set_num_threads(cfg.num_threads)
     seed_everything(worker_config(cfg, number, restarts).seed)
     serving = _Serving(number, open_bytes(pulse, PULSE_BYTES).view(torch.int64), pipe)
@@ -193,20 +181,3 @@ def _takes_a_text(kind: type[BaseException]) -> bool:
 
 def _base(error: ConfigError | EnvironmentFailure) -> type[ConfigError] | type[EnvironmentFailure]:
     return ConfigError if isinstance(error, ConfigError) else EnvironmentFailure
-
-
-def _follow_parent() -> None:
-    """Do not outlive the driver, however it ends."""
-    parent: Any = parent_process()
-
-    # a thread cannot run while the environment's own code holds Python's lock: the kernel can
-    if sys.platform.startswith("linux"):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if not parent.is_alive():
-            os._exit(1)
-
-    def follow() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
