@@ -1,5 +1,6 @@
 #!/usr/bin/env python3
-"""Measure training with workers: decisions a second for 0, 1 and 2 of them, with overlap and without.
+"""Measure training with workers: decisions a second for 0, 1 and 2 of them, with overlap and without,
+and with two learners.
 
 Every variant trains the scene's preset for some iterations; they take turns, so that the ratios hold on a
 machine that is shared. What is timed is the whole loop: collecting, learning, metrics, the state that a
@@ -32,6 +33,8 @@ VARIANTS = (
     ("2", ["collect.workers=2"]),
     ("1, overlap", ["collect.workers=1", "collect.overlap=true"]),
     ("2, overlap", ["collect.workers=2", "collect.overlap=true"]),
+    ("0, 2 learners", ["learners=2", "update_threads=1"]),
+    ("2, 2 learners", ["collect.workers=2", "learners=2", "update_threads=1"]),
 )
 QUIET = ["log.loggers=[]", "log.progress=false", "export_onnx=false"]
 ENDLESS = ["max_steps=1000000000", "checkpoint_interval=1000000000", "matches.interval=null"]
@@ -55,7 +58,8 @@ def main() -> None:
         for _ in range(arguments.repeats):
             for name, lines in VARIANTS:
                 options = [f"env={scene}", *QUIET, *ENDLESS, *arguments.option, *lines]
-                options += [f"collect.engine={arguments.engine}"] if lines else []
+                has_workers = any(line.startswith("collect.workers") for line in lines)
+                options += [f"collect.engine={arguments.engine}"] if has_workers else []
                 rates[name].append(measure(options, arguments.iterations))
         print_table(scene, rates)
     print(f"load average {os.getloadavg()[0]:.2f}")
@@ -77,12 +81,12 @@ def measure(options: list[str], iterations: int) -> float:
 
 def print_table(scene: str, rates: dict[str, list[float]]) -> None:
     """Print medians, and ratios to the first variant of the same repeat."""
-    print(f"\n{scene}\n{'workers':12} {'decisions/s':>12}  ratio to 0 workers (least to most)")
+    print(f"\n{scene}\n{'workers':14} {'decisions/s':>12}  ratio to 0 workers (least to most)")
     first = next(iter(rates.values()))
     for name, values in rates.items():
         ratios = [value / base for value, base in zip(values, first)]
         print(
-            f"{name:12} {statistics.median(values):12,.0f}  {statistics.median(ratios):.2f} "
+            f"{name:14} {statistics.median(values):12,.0f}  {statistics.median(ratios):.2f} "
             f"({min(ratios):.2f} to {max(ratios):.2f})"
         )
 

@@ -790,6 +790,8 @@ class Config:
     """Threads of torch while collecting; small networks want one."""
     update_threads: int = 1
     """Threads of torch while learning, at most one a core; large minibatches gain where a core is idle."""
+    learners: int = 1
+    """Processes that learn side by side, each from a part of the teams; with device=cuda on a GPU each."""
     resume: Optional[str] = None
     """Run folder or checkpoint file to resume, in the same folder."""
     init_from: Optional[str] = None
@@ -808,6 +810,7 @@ class Config:
         _at_least("keep_checkpoints", self.keep_checkpoints, 1)
         _at_least("num_threads", self.num_threads, 1)
         _at_least("update_threads", self.update_threads, 1)
+        _at_least("learners", self.learners, 1)
         _at_least("max_jobs", self.max_jobs, 1)
         _rule("stop_at_return", self.stop_at_return, True, "must be a finite number or null")
 

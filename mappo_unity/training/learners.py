@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from mlagents_envs.base_env import BehaviorSpec, ObservationSpec
 
@@ -19,7 +19,7 @@ from mappo_unity.learning.networks.images import check_sides
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.rewards.streams import RewardStreams, make_intrinsic
 from mappo_unity.scenes.contract.images import looks_unmarked
-from mappo_unity.training.collection.description import Played
+from mappo_unity.training.collection.description import Played, describe
 from mappo_unity.training.memory import check_batch_memory, check_network_memory
 
 
@@ -88,6 +88,18 @@ def _make_learner(
     share = bc.steps / cfg.max_steps if bc.steps else None
     cloning = Cloning(actor, expert(bc.demos), bc, ppo, share) if bc.demos else None
     return PolicyLearner(actor, critic, ppo, streams, cloning)
+
+
+def check_learners(cfg: Config, env: Played, learners: Mapping[str, PolicyLearner]) -> None:
+    """Raise ConfigError where several learners cannot share the teams of the policies that learn."""
+    for name, learner in learners.items():
+        learner.check_joins(cfg.learners)
+        teams = describe(env).teams(name)
+        if cfg.learners > teams:
+            raise ConfigError(
+                f"learners={cfg.learners} is more than the teams of {name!r}, of which each learner gets "
+                f"some: there are {teams}; lower learners, or raise env.num_areas"
+            )
 
 
 def note_unmarked(name: str, sensors: Sequence[ObservationSpec], note: Callable[[str], None]) -> None:

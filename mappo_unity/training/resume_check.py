@@ -85,6 +85,12 @@ def check_workers(path: Path, state: dict[str, Any], workers: int) -> None:
         )
 
 
+def known_generators(state: dict[str, Any], learners: int) -> list[Any] | None:
+    """Return the generators of the learners beside the first, where a checkpoint has them of as many."""
+    generators: list[Any] | None = state.get("generators")
+    return generators if generators is not None and len(generators) == learners - 1 else None
+
+
 def has_snapshot(state: dict[str, Any]) -> bool:
     """Return whether a checkpoint holds its environments' states; without them new episodes begin."""
     return all(part["env"] is not None for part in state.get("workers") or [state])

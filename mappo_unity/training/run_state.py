@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from mappo_unity.training.resume_check import (
     describe_models,
     describe_policies,
     has_snapshot,
+    known_generators,
 )
 from mappo_unity.training.self_play.self_play import SelfPlay
 from mappo_unity.training.setup import TrainingSetup
@@ -197,10 +197,9 @@ class RunState:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that resuming needs, between two iterations; what is trained is copied."""
-        learners = {name: learner.state_dict() for name, learner in self.setup.learners.items()}
         self_play = self.self_play.state_dict() if self.self_play is not None else None
         return self._about() | {
-            "learners": copy.deepcopy(learners),
+            **self.setup.learners_state(),
             "self_play": self_play,
             **self.setup.fleet.state_dict(),
             "window": self.recent_episodes.state_dict(),
@@ -227,6 +226,7 @@ class RunState:
         for name, learner in self.setup.learners.items():
             learner.load_state_dict(state["learners"][name])
         check_workers(path, state, self.cfg.collect.workers)
+        self.setup.generators = known_generators(state, self.cfg.learners)
         self._restore_fleet(path, state)
         self._restore_lessons(state.get("lessons", {}), is_new=not has_snapshot(state))
 

@@ -6,11 +6,13 @@ before the first step.
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -21,6 +23,7 @@ from mappo_unity.config.schema import CollectConfig, Config, Engine
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.learning.networks.opponents import Opponents
+from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.training.collection.batches import Batch, count_decisions
@@ -28,8 +31,10 @@ from mappo_unity.training.collection.description import Played, describe
 from mappo_unity.training.collection.fleet import Batches, Fleet, SoleWorker
 from mappo_unity.training.collection.several_workers import LocalWorkers
 from mappo_unity.training.collection.shared_memory import WorkerProcesses
-from mappo_unity.training.learners import make_learners
+from mappo_unity.training.learners import check_learners, make_learners
 from mappo_unity.training.lessons.curriculum import lessons_of
+from mappo_unity.training.side_by_side.parts import Task, learn
+from mappo_unity.training.side_by_side.processes import LearnerProcesses
 
 
 class TrainingSetup:
@@ -43,7 +48,7 @@ class TrainingSetup:
     by policy name; `policy`, their actors as one; `lessons` of environment parameters;
     `notes`, lines for the user; `frozen`, the policy names that only play; `opponents`, who plays some of the
     teams instead of the learners, with self-play; `guesses_channels`, whether `guess_channels` built the
-    networks.
+    networks; `generators`, of random numbers, of the learners beside these, in the run that is resumed.
 
     Raises:
         ConfigError: options do not fit the environment, or what they ask for does not fit into memory.
@@ -57,6 +62,8 @@ class TrainingSetup:
         self.notes += self.lessons.notes
 
         self.opponents = Opponents() if cfg.self_play.is_on else None
+        self.generators: list[Any] | None = None
+        self._beside: LearnerProcesses | None = None
         self.guesses_channels = False
         self._make_learners(self.notes.append)
         if len(self.frozen) == len(self.learners):
@@ -79,13 +86,34 @@ class TrainingSetup:
         self.frozen = {name for name in self.learners if is_frozen(self.cfg, name)}
         for name in self.frozen:
             self.learners[name].actor.moving_norms = []
+        check_learners(self.cfg, self.env, self._learning)
+
+    @property
+    def _learning(self) -> dict[str, PolicyLearner]:
+        return {name: learner for name, learner in self.learners.items() if name not in self.frozen}
 
     @contextmanager
     def collecting(self) -> Iterator[Batches]:
         """Yield endless batches, collected from where the environments stand."""
         keeps_ends = any(learner.rewards.intrinsic for learner in self.learners.values())
         self.fleet.start(self.policy, keeps_ends)
-        yield Batches(self.fleet, self.policy, self.cfg)
+        with self._beside_others():
+            yield Batches(self.fleet, self.policy, self.cfg)
+
+    @contextmanager
+    def _beside_others(self) -> Iterator[None]:
+        """Let the learners learn beside those of other processes, where `learners` asks for them."""
+        if self.cfg.learners == 1:
+            yield
+            return
+        rounds = batch_rounds(self.cfg.collect, self.env)
+        others = self._learning, describe(self.env), rounds, self.guesses_channels, self.generators
+        self._beside = LearnerProcesses(self.cfg, *others)
+        try:
+            yield
+        finally:
+            self._beside.close()
+            self._beside = None
 
     def learn(self, batch: Batch, progress: float) -> dict[str, dict[str, float]]:
         """Improve every policy by a batch; return the metrics of each.
@@ -97,22 +125,33 @@ class TrainingSetup:
         share = count_decisions(batch.rounds, self.learners) / self.cfg.max_steps
         # Large minibatches gain from threads; small networks, while collecting, do not.
         torch.set_num_threads(min(self.cfg.update_threads, os.cpu_count() or 1))
-        metrics: dict[str, dict[str, float]] = {}
-        for name, learner in self.learners.items():
-            if name in batch.void:
-                learner.carried.void(batch.void[name])
-            if name not in self.frozen:
-                ahead = share if learner.cfg.schedules_count_batch else 0.0
-                metrics[name] = learner.learn(*batch.of(name), progress + ahead)
-            if self.frozen:
-                metrics.setdefault(name, {})["frozen"] = float(name in self.frozen)
+        tasks = {}
+        for name, learner in self._learning.items():
+            ahead = share if learner.cfg.schedules_count_batch else 0.0
+            tasks[name] = Task(*batch.of(name), batch.void.get(name), progress + ahead)
+        learned = self._beside.learn(tasks) if self._beside is not None else learn(self.learners, tasks)
         torch.set_num_threads(self.cfg.num_threads)
-        return metrics
+
+        frozen = {
+            name: {"frozen": float(name in self.frozen)} if self.frozen else {} for name in self.learners
+        }
+        return {name: learned.get(name, {}) | is_frozen for name, is_frozen in frozen.items()}
+
+    def learners_state(self) -> dict[str, Any]:
+        """Return the states of all learners, and the generators of those in other processes."""
+        states = {name: learner.state_dict() for name, learner in self.learners.items()}
+        generators = None
+        if self._beside is not None:
+            whole, generators = self._beside.states()
+            states |= whole
+        return {"learners": copy.deepcopy(states), "generators": generators}
 
     def forget_pending(self) -> None:
         """Drop the decisions whose outcome has not arrived: the environment was reset."""
         for learner in self.learners.values():
             learner.carried.rounds = None
+        if self._beside is not None:
+            self._beside.forget_pending()
 
 
 @contextmanager
