@@ -618,6 +618,14 @@ class RewardsConfig:
         return {name: stream for name, stream in streams.items() if stream.strength > 0}
 
 
+class MatmulPrecision(Enum):
+    """How products of float32 matrices are computed."""
+
+    highest = "highest"
+    high = "high"
+    medium = "medium"
+
+
 class Engine(Enum):
     """Where workers run."""
 
@@ -790,6 +798,9 @@ class Config:
     """Threads of torch while collecting; small networks want one."""
     update_threads: int = 1
     """Threads of torch while learning, at most one a core; large minibatches gain where a core is idle."""
+    matmul_precision: MatmulPrecision = MatmulPrecision.highest
+    """Of float32 matrix products while training, as torch.set_float32_matmul_precision has it: highest, high
+    (TensorFloat32 on GPUs) or medium (bfloat16 inside, on CPUs that have instructions for it, too)."""
     learners: int = 1
     """Processes that learn side by side, each from a part of the teams; with device=cuda on a GPU each."""
     resume: Optional[str] = None

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +23,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.learning.networks.opponents import Opponents
 from mappo_unity.learning.ppo import PolicyLearner
+from mappo_unity.learning.torch_settings import compute_as
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.training.collection.batches import Batch, count_decisions
@@ -124,13 +124,13 @@ class TrainingSetup:
         """
         share = count_decisions(batch.rounds, self.learners) / self.cfg.max_steps
         # Large minibatches gain from threads; small networks, while collecting, do not.
-        torch.set_num_threads(min(self.cfg.update_threads, os.cpu_count() or 1))
+        compute_as(self.cfg, self.cfg.update_threads)
         tasks = {}
         for name, learner in self._learning.items():
             ahead = share if learner.cfg.schedules_count_batch else 0.0
             tasks[name] = Task(*batch.of(name), batch.void.get(name), progress + ahead)
         learned = self._beside.learn(tasks) if self._beside is not None else learn(self.learners, tasks)
-        torch.set_num_threads(self.cfg.num_threads)
+        compute_as(self.cfg, self.cfg.num_threads)
 
         frozen = {
             name: {"frozen": float(name in self.frozen)} if self.frozen else {} for name in self.learners
@@ -196,8 +196,8 @@ def _ray_workers(cfg: Config, folder: Path) -> Fleet:
 
 
 def prepare_torch(cfg: Config) -> None:
-    """Set threads and seeds; check the device."""
-    torch.set_num_threads(cfg.num_threads)
+    """Set threads, precision and seeds; check the device."""
+    compute_as(cfg, cfg.num_threads)
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every storage
     check_device(cfg.device)
     seed_everything(cfg.seed)

@@ -25,6 +25,7 @@ from torch import Tensor
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.learning.networks.joint_policy import JointPolicy
+from mappo_unity.learning.torch_settings import compute_as
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.training.child_process import begin_child
 from mappo_unity.training.collection.slab import Layout, open_bytes, rows_of, write
@@ -98,7 +99,7 @@ def main(cfg: Config, number: int, folder: Path, restarts: int, pulse: str, pipe
         pipe: to the driver.
     """
     begin_child()
-    torch.set_num_threads(cfg.num_threads)
+    compute_as(cfg, cfg.num_threads)
     seed_everything(worker_config(cfg, number, restarts).seed)
     serving = _Serving(number, open_bytes(pulse, PULSE_BYTES).view(torch.int64), pipe)
     try:

@@ -20,6 +20,7 @@ import torch.distributed as dist
 from mappo_unity.config.schema import Config
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.reduction import SeveralLearners
+from mappo_unity.learning.torch_settings import compute_as
 from mappo_unity.runs.rng import get_rng_state, seed_everything, set_rng_state
 from mappo_unity.training.child_process import begin_child
 from mappo_unity.training.collection.description import Description
@@ -43,7 +44,7 @@ def main(cfg: Config, rank: int, meeting: str, pipe: Connection) -> None:
         pipe: to the driver.
     """
     begin_child()
-    torch.set_num_threads(min(cfg.update_threads, os.cpu_count() or 1))
+    compute_as(cfg, cfg.update_threads)
     seed_everything((cfg.seed + rank * SEED_DISTANCE) % 2**31)
     here = LearnersHere(cfg, rank, meeting)
     try:

@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDictBase
 
 from mappo_unity.config.schema import Config
+from mappo_unity.learning.torch_settings import compute_as
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.training.collection.description import Description
 from mappo_unity.training.collection.slab import Layout, make_layout, rows_of, write
@@ -95,7 +96,7 @@ class WorkerActor(Answering):
 
     def _opened(self) -> Description:
         self._place.enter()
-        torch.set_num_threads(self._cfg.num_threads)
+        compute_as(self._cfg, self._cfg.num_threads)
         seed_everything(worker_config(self._cfg, self._number, self._restarts).seed)
         self._worker = make_worker(self._cfg, self._number, self._folder, self._restarts)
         self._parts = [self._worker.describe()]
