@@ -31,7 +31,7 @@ from mappo_unity.envs.backends import make_env_function
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.serve import Player, env_function
-from mappo_unity.training.episode_stats import count_decisions
+from mappo_unity.training.collection.batches import count_decisions
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.setup import TrainingSetup, set_up
 
@@ -186,13 +186,13 @@ def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
         bare.measure(arguments.rounds)
         wall, cpu, player = time.perf_counter(), time.process_time(), cpu_s(pid)
         batch = next(batches)
-        rounds = batch.shape[0]
+        rounds = batch.rounds.shape[0]
         whole.append(
             (
                 (time.perf_counter() - wall) / rounds * 1e6,
                 (time.process_time() - cpu) / rounds * 1e6,
                 (cpu_s(pid) - player) / rounds * 1e6,
-                count_decisions(batch, list(setup.learners)) / rounds,
+                count_decisions(batch.rounds, setup.learners) / rounds,
             )
         )
     bare_rates = [a / w for a, w in zip(bare.agents_per_step, bare.wall_us)]

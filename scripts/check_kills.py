@@ -5,7 +5,7 @@ The preset is trained to its end with two workers. As soon as a worker plays, on
 random pause, again and again. Afterwards every worker that was killed must have been counted, the decisions
 must add up, no process may be left, and the best policy is evaluated.
 
-    python scripts/check_kills.py [--scene 3DBall] [--kills 20] [--goal 95] [options of mappo-train]
+    python scripts/check_kills.py [--scene 3DBall] [--kills 20] [--goal 95] [--engine ray] [OPTION ...]
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from learn_scene import mappo_eval
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.runs.folder import write_record
-from mappo_unity.training.collection.processes import WorkerProcesses
+from mappo_unity.training.collection.processes import RemoteWorkers
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.trainer import train
 
@@ -40,10 +40,12 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--goal", type=float, default=95.0, help="mean return that the best policy must earn")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--engine", choices=["processes", "ray"], default="processes", help="of workers")
     parser.add_argument("options", nargs="*", help="further options of mappo-train")
     arguments = parser.parse_intermixed_args()
 
     lines = [f"env={arguments.scene}", f"seed={arguments.seed}", f"collect.workers={WORKERS}"]
+    lines += [f"collect.engine={arguments.engine}"]
     lines += [f"env.max_restarts={arguments.kills}", "export_onnx=false", *arguments.options]
     killer = Killer(arguments.kills, arguments.seed)
     print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores", flush=True)
@@ -78,17 +80,17 @@ class Killer:
         self.killed: list[int] = []
         self.seen: set[int] = set()
         self._kills, self._random = kills, random.Random(seed)
-        self._fleet: WorkerProcesses | None = None
+        self._fleet: RemoteWorkers | None = None
         self._is_over = threading.Event()
         self._thread = threading.Thread(target=self._kill, daemon=True)
 
     def watch(self, state: RunState) -> str | None:
         """Begin after the first iteration; see `AfterIteration`."""
         if self._fleet is None:
-            assert isinstance(state.setup.fleet, WorkerProcesses)
+            assert isinstance(state.setup.fleet, RemoteWorkers)
             self._fleet = state.setup.fleet
             self._thread.start()
-        self.seen.update(process.pid for process in self._fleet.processes)
+        self.seen.update(process.pid for process in self._fleet.processes if process.pid is not None)
         return None
 
     def end(self) -> None:
@@ -103,6 +105,8 @@ class Killer:
             if not processes:
                 return
             pid = self._random.choice(processes).pid
+            if pid is None:  # not started yet
+                continue
             self.seen.add(pid)
             if pid not in self.killed and is_alive(pid):  # else its replacement is on its way
                 os.kill(pid, signal.SIGKILL)

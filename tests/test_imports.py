@@ -45,6 +45,19 @@ def test_modules_import_only_upward():
             del left[name]
 
 
+def test_scripts_find_what_they_import():
+    scripts = PACKAGE.parent / "scripts"
+    paths = [path for path in sorted(scripts.glob("*.py")) if path.name != "vmas_env.py"]  # needs vmas itself
+    code = f"""
+import importlib, sys
+sys.path.insert(0, {str(scripts)!r})
+for name in {[path.stem for path in paths]!r}:
+    importlib.import_module(name)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert len(paths) > 20 and done.returncode == 0, done.stderr
+
+
 def test_options_and_help_need_no_torch():
     light = "mappo_unity.config.compose, mappo_unity.cli, mappo_unity.cli.help"
     code = f"import sys, {light}; sys.exit('torch' in sys.modules)"
