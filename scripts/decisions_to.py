@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Say after how many decisions runs reached a mean return, and what they came to.
+"""Say after how many decisions runs reached a mean return, or another metric a value, and what they came to.
 
 Runs are named by their folders, or by folders that hold some. Printed is a table in Markdown: each run's
-decisions and minutes until return_mean, of the last 100 episodes, was RETURN for the first time (a dash:
-never), its best and its last mean return, and its decisions.
+decisions and minutes (of collecting and learning) until the metric, return_mean of the last 100 episodes
+unless another column of metrics.csv is named, was VALUE for the first time (a dash: never), its best and its
+last value, and the run's decisions.
 
-    python scripts/decisions_to.py RETURN RUN ...
+    python scripts/decisions_to.py VALUE RUN ... [--metric COLUMN]
 """
 
 from __future__ import annotations
@@ -22,28 +23,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("goal", type=float, metavar="RETURN")
+    parser.add_argument("goal", type=float, metavar="VALUE")
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    parser.add_argument("--metric", default="return_mean", help="column of metrics.csv")
     arguments = parser.parse_args()
 
     print(f"| run | decisions to {arguments.goal:g} | minutes | best | last | decisions |")
     print("|---|---|---|---|---|---|")
     for given in arguments.runs:
         for path in sorted(given.rglob("metrics.csv")):
-            print(row(path.parent, arguments.goal))
+            print(row(path.parent, arguments.goal, arguments.metric))
 
 
-def row(run: Path, goal: float) -> str:
+def row(run: Path, goal: float, metric: str) -> str:
     """Return a run's row of the table."""
     metrics = [
         {name: float(value) for name, value in line.items() if value}
         for line in read_metrics(run / "metrics.csv")
     ]
-    # before the first episode ends there is no mean
-    returns = [line.get("return_mean", math.nan) for line in metrics]
-    reached = next((line for line, value in zip(metrics, returns) if value >= goal), None)
+    # not every row has a value: before the first episode ends there is no mean
+    values = [line.get(metric, math.nan) for line in metrics]
+    reached = next((line for line, value in zip(metrics, values) if value >= goal), None)
     first = f"{reached['agent_steps']:,.0f} | {reached['wall_s'] / 60:.1f}" if reached else "- | -"
-    known = [value for value in returns if not math.isnan(value)]
+    known = [value for value in values if not math.isnan(value)]
     best, last = (f"{max(known):.2f}", f"{known[-1]:.2f}") if known else ("-", "-")
     return f"| {run.parent.name}/{run.name} | {first} | {best} | {last} | {metrics[-1]['agent_steps']:,.0f} |"
 
