@@ -235,6 +235,8 @@ class TestNames:
             for name in ("cuda:1", "cuda:99999"):
                 with pytest.raises(ConfigError, match=f"device={name}: the last .* finds is cuda:0"):
                     check_device(name)
+            with pytest.raises(ConfigError, match="learners=3 with device=cuda needs .* up to cuda:2, but"):
+                check_device("cuda", learners=3)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU that torch finds")

@@ -199,19 +199,25 @@ def prepare_torch(cfg: Config) -> None:
     """Set threads, precision and seeds; check the device."""
     compute_as(cfg, cfg.num_threads)
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every storage
-    check_device(cfg.device)
+    check_device(cfg.device, cfg.learners)
     seed_everything(cfg.seed)
 
 
-def check_device(device: str) -> None:
-    """Raise ConfigError if torch does not find the device of the networks."""
+def check_device(device: str, learners: int = 1) -> None:
+    """Raise ConfigError if torch does not find the device of the networks, or one for each learner."""
     if device == "cpu":
         return
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if not count:
         raise ConfigError(f"device={device}: this torch finds no CUDA device; use device=cpu")
-    if int(device.partition(":")[2] or 0) >= count:
+    first = int(device.partition(":")[2] or 0)
+    if first >= count:
         raise ConfigError(f"device={device}: the last CUDA device that torch finds is cuda:{count - 1}")
+    if first + learners > count:
+        raise ConfigError(
+            f"learners={learners} with device={device} needs the CUDA devices up to cuda:"
+            f"{first + learners - 1}, but the last one that torch finds is cuda:{count - 1}; lower learners"
+        )
 
 
 def batch_rounds(cfg: CollectConfig, env: Played) -> int:
