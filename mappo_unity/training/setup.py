@@ -132,10 +132,9 @@ class TrainingSetup:
         learned = self._beside.learn(tasks) if self._beside is not None else learn(self.learners, tasks)
         compute_as(self.cfg, self.cfg.num_threads)
 
-        frozen = {
-            name: {"frozen": float(name in self.frozen)} if self.frozen else {} for name in self.learners
-        }
-        return {name: learned.get(name, {}) | is_frozen for name, is_frozen in frozen.items()}
+        for name in self.learners if self.frozen else ():
+            learned[name] = learned.get(name, {}) | {"frozen": float(name in self.frozen)}
+        return learned
 
     def learners_state(self) -> dict[str, Any]:
         """Return the states of all learners, and the generators of those in other processes."""
