@@ -391,6 +391,7 @@ def test_recordings_fit_the_embedded_scenes(unity_demos: Path) -> None:
         ("3DBall", "3DBall"),
         ("Basic", "Basic"),
         ("Hallway", "Hallway"),
+        ("PushBlock", "PushBlock"),
         ("Pyramids", "Pyramid"),
     ):
         demo = read_demo(unity_demos / f"Expert{file}.demo")

@@ -1,0 +1,37 @@
+"""What the agents of both scenes with blocks have in common: size, mass, and what their actions do."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mappo_unity.scenes.core.ground import TICK_S
+
+AGENT_HALF = (0.5, 0.5, 0.5)
+AGENT_MASS, AGENT_DRAG = 10.0, 4.0  # kg, 1/s
+BLOCK_HALF_Y = 0.375
+BLOCK_DRAG = 0.5  # 1/s
+RUN_SPEED = 3.0  # m/s gained in a tick
+STRAFE_SPEED = 0.75 * RUN_SPEED
+TURN_RAD = np.radians(200.0) * TICK_S  # in a tick
+
+# One row an action: gained speed ahead and to the right (m/s), turn to the right (rad), in a tick.
+ACTIONS = np.array(
+    [
+        [0.0, 0.0, 0.0],
+        [RUN_SPEED, 0.0, 0.0],
+        [-RUN_SPEED, 0.0, 0.0],
+        [0.0, 0.0, TURN_RAD],
+        [0.0, 0.0, -TURN_RAD],
+        [0.0, -STRAFE_SPEED, 0.0],
+        [0.0, STRAFE_SPEED, 0.0],
+    ]
+)
+
+
+def drives(action: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gained velocities [..., 2] (x, z; m/s) and the new headings [...] for actions [...]."""
+    ahead, right, turn = np.moveaxis(ACTIONS[action], -1, 0)
+    # An agent never turns and drives at once: the order is free.
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    drive = np.stack([ahead * sin + right * cos, ahead * cos - right * sin], axis=-1)
+    return drive, yaw + turn

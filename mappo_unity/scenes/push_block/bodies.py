@@ -1,0 +1,193 @@
+"""Boxes that slide on the floor of a square room and push each other: agents and blocks, without an engine.
+
+All boxes stand upright, so that contacts are found from above (`contacts.py`) and solved in the plane
+(`solver.py`); heights only matter for the fall after a reset. As in Unity's engine: forces and drag, then
+contacts with the floor's friction, then motion; overlaps that are left after it are pushed apart.
+Legend: N areas, B bodies of an area. Area coordinates: x right, y up, z forward; metres; floor at y = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mappo_unity.scenes.core.ground import BOX_FRICTION, TICK_S
+from mappo_unity.scenes.push_block.contacts import (
+    Poses,
+    Room,
+    joined,
+    meet,
+    near_pairs,
+    pair_contacts,
+    plan_extents,
+    wall_contacts,
+)
+from mappo_unity.scenes.push_block.solver import Floor, solve
+
+MAX_SPIN = 7.0  # rad/s: the engine's limit
+SPIN_KEPT = 1.0 - 0.05 * TICK_S
+PUSH_ROUNDS = 10
+DEEP = 1e-3  # m: overlaps below this are left to the next tick
+
+_STATE = ("place", "height", "yaw", "motion", "fall", "half", "kept", "hold", "rub", "present")
+
+
+class SlidingBoxes:
+    """Keep and move B boxes in each of N areas.
+
+    Attributes, float64, to be read and written in place: `place` [N, B, 2], x and z of the centres; `height`
+    [N, B]; `yaw` [N, B], rad, clockwise from above; `motion` [N, B, 3], velocity along x and z (m/s) and spin
+    (rad/s); `fall` [N, B], vertical velocity; `half` [N, B, 2], half sizes along right and
+    forward, to be changed by `resize`; `kept` [N, B], share of the speed that drag leaves in a tick; `hold`,
+    `rub` [N, B], static and dynamic friction with the floor, doubled (`ground.py`); `present` bool [N, B]; `gravity`, m/s^2.
+
+    Arguments: `half` [B, 3] (right, up, forward), `mass` [B] kg, `drag` [B] 1/s; `turns` [B]: whether
+    contacts turn a body (else its yaw is only set); `room`: faces of the walls.
+    """
+
+    def __init__(
+        self,
+        num_areas: int,
+        half: np.ndarray,
+        mass: Sequence[float],
+        drag: Sequence[float],
+        turns: Sequence[bool],
+        room: Room,
+        gravity: float,
+    ) -> None:
+        shape = (num_areas, len(mass))
+        self.room, self.gravity = room, gravity
+        self.rest = np.asarray(half)[:, 1]  # height of the centre on the floor
+
+        self.place = np.zeros((*shape, 2))
+        self.height = np.tile(self.rest, (num_areas, 1))
+        self.yaw = np.zeros(shape)
+        self.motion = np.zeros((*shape, 3))
+        self.fall = np.zeros(shape)
+
+        self.half = np.tile(np.asarray(half)[:, ::2], (num_areas, 1, 1)).astype(float)
+        self.kept = np.tile(1.0 - np.asarray(drag) * TICK_S, (num_areas, 1))
+        self.hold, self.rub = np.full(shape, BOX_FRICTION), np.full(shape, BOX_FRICTION)
+        self.present = np.ones(shape, bool)
+
+        self._mass = np.asarray(mass, float)
+        self._turns = np.asarray(turns, bool)
+        self._pairs = np.array(np.triu_indices(len(mass), 1))
+        self._weigh()
+
+    def step(self, drive: np.ndarray) -> None:
+        """Advance by one tick; `drive` [N, B, 2]: velocity changes along x and z, m/s."""
+        motion = self.motion
+        motion[..., :2] += drive
+        motion[..., :2] *= self.kept[..., None]
+        if self._turns.any():
+            motion[..., 2] = np.clip(motion[..., 2] * SPIN_KEPT, -MAX_SPIN, MAX_SPIN)
+        landed = self._land()
+
+        poses = self.poses()
+        contacts = joined(
+            [
+                pair_contacts(poses, self._pairs, motion, self._turns),
+                wall_contacts(poses, self.room, motion, self._turns),
+            ]
+        )
+        solve(contacts, motion, self._weight, self._floor(landed))
+
+        self.place += motion[..., :2] * TICK_S
+        self.yaw += motion[..., 2] * TICK_S
+        self._separate()
+
+    def resize(self, areas: np.ndarray, body: int, half: np.ndarray) -> None:
+        """Give a body of `areas` [n] other half sizes along its right and forward, [n, 2] m; mass stays."""
+        self.half[areas, body] = half
+        self._weigh()
+
+    def poses(self) -> Poses:
+        """Return where the boxes are, seen from above."""
+        return Poses(self.place, self.yaw, self.half, self.present)
+
+    def deepest(self) -> np.ndarray:
+        """Return the deepest overlap of any two boxes of an area, or of a box and a wall, [N] m."""
+        poses = self.poses()
+        beyond = plan_extents(self.yaw, self.half)
+        out = np.maximum(self.room.low + beyond - self.place, self.place + beyond - self.room.high).max(
+            axis=2
+        )
+        depth: np.ndarray = np.where(self.present, out, 0.0).max(axis=1).clip(0.0)
+        area, one, other = near_pairs(poses, self._pairs, np.zeros(self.yaw.shape))
+        np.maximum.at(depth, area, -meet(poses, area, one, other).gap)
+        return depth
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return copies of all arrays."""
+        return {name: getattr(self, name).copy() for name in _STATE}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Restore what `get_state` returned."""
+        for name in _STATE:
+            getattr(self, name)[...] = state[name]
+        self._weigh()
+
+    def _weigh(self) -> None:
+        """Compute what follows from masses and sizes: inverse masses and inertia, grip against turning."""
+        # Moment of inertia about the vertical, kg m^2: m (w^2 + l^2) / 12.
+        inertia = self._mass * (self.half**2).sum(axis=2) / 3.0
+        self._weight = np.empty(self.motion.shape)
+        self._weight[..., :2] = (1.0 / self._mass)[:, None]
+        self._weight[..., 2] = self._turns / inertia
+
+        # Spin by speed lost to the floor: the two friction anchors of a face stand in opposite corners.
+        self._radius = np.sqrt((self.half**2).sum(axis=2))
+        self._grip = self._mass * self._radius / inertia
+
+    def _land(self) -> np.ndarray:
+        """Fall; return the downward speed that the floor takes, [N, B] m/s."""
+        gap = self.height - self.rest
+        self.fall -= self.gravity * TICK_S
+        self.fall *= self.kept
+        landed = np.maximum(-self.fall - gap / TICK_S, 0.0)
+        self.fall += landed
+        self.height += self.fall * TICK_S
+
+        # No trace of rounding: bodies that stand have exactly that height.
+        standing = landed > 0
+        self.height[standing] = np.broadcast_to(self.rest, standing.shape)[standing]
+        self.fall[standing] = 0.0
+        return landed
+
+    def _floor(self, landed: np.ndarray) -> Floor:
+        """Return what the floor's friction can take in this tick."""
+        rub = self.rub * landed
+        return Floor(self.hold * landed, rub, rub * self._grip)
+
+    def _separate(self) -> None:
+        """Push overlapping boxes apart, the lighter one farther, and all of them into the room."""
+        none = np.zeros(self.yaw.shape)
+        area, one, other = near_pairs(self.poses(), self._pairs, none)
+        beyond = plan_extents(self.yaw, self.half)
+        low, high = self.room.low + beyond, self.room.high - beyond
+
+        self._stay_inside(low, high)
+        if not area.size:
+            return
+
+        share = self._mass[other] / (self._mass[one] + self._mass[other])
+        for _ in range(PUSH_ROUNDS):
+            meeting = meet(self.poses(), area, one, other)
+            deep = np.flatnonzero(meeting.gap < -DEEP)
+            if not deep.size:
+                break
+            way = meeting.normal[deep] * -meeting.gap[deep, None]
+            np.add.at(self.place, (area[deep], one[deep]), way * share[deep, None])
+            np.add.at(self.place, (area[deep], other[deep]), way * (share[deep, None] - 1.0))
+            # Against a wall the other one gives way, in the rounds that follow.
+            self._stay_inside(low, high)
+
+    def _stay_inside(self, low: np.ndarray, high: np.ndarray) -> None:
+        """Put centres within `low` and `high` [N, B, 2], and stop those that went out."""
+        inside = np.minimum(np.maximum(self.place, low), high)
+        out = (inside != self.place) & self.present[..., None]
+        if out.any():
+            self.place[out] = inside[out]
+            self.motion[..., :2][out] = 0.0
