@@ -4,7 +4,7 @@
 Runs are named by their folders, or by folders that hold some. Printed is a table in Markdown: each run's
 decisions and minutes (of collecting and learning) until the metric, return_mean of the last 100 episodes
 unless another column of metrics.csv is named, was VALUE for the first time (a dash: never), its best and its
-last value, and the run's decisions.
+last value, and the run's decisions. A return counts from the 100th episode on: the first few are luck.
 
     python scripts/decisions_to.py VALUE RUN ... [--metric COLUMN]
 """
@@ -16,6 +16,8 @@ import math
 from pathlib import Path
 
 from mappo_unity.runs.metrics_csv import read_metrics
+
+EPISODES = 100  # of a mean return
 
 
 def main() -> None:
@@ -41,8 +43,9 @@ def row(run: Path, goal: float, metric: str) -> str:
         {name: float(value) for name, value in line.items() if value}
         for line in read_metrics(run / "metrics.csv")
     ]
-    # not every row has a value: before the first episode ends there is no mean
-    values = [line.get(metric, math.nan) for line in metrics]
+    # not every row has a value: of matches few have, and returns need episodes
+    needed = EPISODES if metric == "return_mean" else 0
+    values = [line.get(metric, math.nan) if line.get("episodes", 0) >= needed else math.nan for line in metrics]
     reached = next((line for line, value in zip(metrics, values) if value >= goal), None)
     first = f"{reached['agent_steps']:,.0f} | {reached['wall_s'] / 60:.1f}" if reached else "- | -"
     known = [value for value in values if not math.isnan(value)]
