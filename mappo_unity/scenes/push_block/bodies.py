@@ -28,7 +28,8 @@ from mappo_unity.scenes.push_block.solver import Floor, solve
 
 MAX_SPIN = 7.0  # rad/s: the engine's limit
 SPIN_KEPT = 1.0 - 0.05 * TICK_S
-PUSH_ROUNDS = 10
+PUSH_ROUNDS = 40  # only turned blocks at a reset need more than a few
+FAR_IN, REACH = 0.05, 0.7  # m: from there on also those that come into the way are looked at, so far off
 DEEP = 1e-3  # m: overlaps below this are left to the next tick
 
 _STATE = ("place", "height", "yaw", "motion", "fall", "half", "kept", "hold", "rub", "present")
@@ -42,7 +43,8 @@ class SlidingBoxes:
     (rad/s); `fall` [N, B], vertical velocity; `half` [N, B, 2], half sizes along right and
     forward, to be changed by `resize`; `kept` [N, B], share of the speed that drag leaves in a tick; `hold`,
     `rub` [N, B], static and dynamic friction with the floor, doubled (`ground.py`);
-    `present` bool [N, B]; `gravity`, m/s^2.
+    `present` bool [N, B]; `gravity`, m/s^2. To be read: `extent` [N, B, 2], how far they reach along x and z
+    since the last tick.
 
     Arguments: `half` [B, 3] (right, up, forward), `mass` [B] kg, `drag` [B] 1/s; `turns` [B]: whether
     contacts turn a body (else its yaw is only set); `room`: faces of the walls.
@@ -73,6 +75,7 @@ class SlidingBoxes:
         self.hold, self.rub = np.full(shape, BOX_FRICTION), np.full(shape, BOX_FRICTION)
         self.present = np.ones(shape, bool)
 
+        self.extent = self.half.copy()
         self._mass = np.asarray(mass, float)
         self._turns = np.asarray(turns, bool)
         self._any_turns = bool(self._turns.any())
@@ -167,22 +170,28 @@ class SlidingBoxes:
     def _separate(self, near: Pairs) -> None:
         """Push overlapping boxes apart, the lighter one farther, and all of them into the room."""
         boxes = self.outlines()
+        self.extent = boxes.extent
         low, high = self.room.low + boxes.extent, self.room.high - boxes.extent
         self._stay_inside(low, high)
         if not near.area.size:
             return
 
-        share = self._mass[near.other] / (self._mass[near.one] + self._mass[near.other])
+        widened = False
         for _ in range(PUSH_ROUNDS):
             boxes.table[..., :2] = self.place
             meeting = meet(boxes, near)
             deep = (meeting.gap < -DEEP).nonzero()[0]
             if not deep.size:
                 break
+            if not widened and meeting.gap.min() < -FAR_IN:
+                near, widened = near_pairs(boxes, self._pairs, REACH), True
+                continue
+
             area, one, other = near.at(deep)
             way = (meeting.normal[:, deep] * -meeting.gap[deep]).T
-            np.add.at(self.place, (area, one), way * share[deep, None])
-            np.add.at(self.place, (area, other), way * (share[deep, None] - 1.0))
+            share = (self._mass[other] / (self._mass[one] + self._mass[other]))[:, None]
+            np.add.at(self.place, (area, one), way * share)
+            np.add.at(self.place, (area, other), way * (share - 1.0))
             # Against a wall the other one gives way, in the rounds that follow.
             self._stay_inside(low, high)
 

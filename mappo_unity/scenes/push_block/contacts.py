@@ -2,8 +2,8 @@
 
 Two boxes meet along the axis that separates them best; the contact is the piece of the one's edge that faces
 the other's, by its two ends. A contact counts as far as bodies can come in the tick, so that fast ones do not
-enter each other (Unity's engine looks only 0.02 m far). Areas are few and arrays small, so vectors are kept by
-component: fewer calls are faster.
+enter each other (Unity's engine looks only 0.02 m far). Areas are few and arrays small, so vectors are kept
+by component: fewer calls are faster.
 Legend: N areas, B bodies of an area, P pairs of bodies, K pairs or bodies that are looked at closely.
 """
 
@@ -26,7 +26,7 @@ class Outlines(NamedTuple):
     """Boxes from above: what contacts are found from."""
 
     table: np.ndarray
-    """[N, B, 6]: x, z of the centre (m), sine and cosine of the yaw, half sizes along right and forward (m)."""
+    """[N, B, 6]: x, z of the centre, m; sine and cosine of the yaw; half sizes along right and forward, m."""
     extent: np.ndarray
     """[N, B, 2], m: how far they reach along x and z."""
     radius: np.ndarray
