@@ -30,8 +30,10 @@ ACTIONS = np.array(
 
 def drives(action: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the gained velocities [..., 2] (x, z; m/s) and the new headings [...] for actions [...]."""
-    ahead, right, turn = np.moveaxis(ACTIONS[action], -1, 0)
+    chosen = ACTIONS[action]
+    ahead, right = chosen[..., 0], chosen[..., 1]
     # An agent never turns and drives at once: the order is free.
     sin, cos = np.sin(yaw), np.cos(yaw)
-    drive = np.stack([ahead * sin + right * cos, ahead * cos - right * sin], axis=-1)
-    return drive, yaw + turn
+    drive = np.empty((*yaw.shape, 2))
+    drive[..., 0], drive[..., 1] = ahead * sin + right * cos, ahead * cos - right * sin
+    return drive, yaw + chosen[..., 2]

@@ -14,20 +14,22 @@ import numpy as np
 
 from mappo_unity.scenes.core.ground import BOX_FRICTION, TICK_S
 from mappo_unity.scenes.push_block.contacts import (
-    Poses,
+    Outlines,
+    Pairs,
     Room,
     joined,
     meet,
     near_pairs,
+    outlines,
     pair_contacts,
-    plan_extents,
     wall_contacts,
 )
 from mappo_unity.scenes.push_block.solver import Floor, solve
 
 MAX_SPIN = 7.0  # rad/s: the engine's limit
 SPIN_KEPT = 1.0 - 0.05 * TICK_S
-PUSH_ROUNDS = 10
+PUSH_ROUNDS = 40  # only turned blocks at a reset need more than a few
+FAR_IN, REACH = 0.05, 0.7  # m: from there on also those that come into the way are looked at, so far off
 DEEP = 1e-3  # m: overlaps below this are left to the next tick
 
 _STATE = ("place", "height", "yaw", "motion", "fall", "half", "kept", "hold", "rub", "present")
@@ -40,7 +42,9 @@ class SlidingBoxes:
     [N, B]; `yaw` [N, B], rad, clockwise from above; `motion` [N, B, 3], velocity along x and z (m/s) and spin
     (rad/s); `fall` [N, B], vertical velocity; `half` [N, B, 2], half sizes along right and
     forward, to be changed by `resize`; `kept` [N, B], share of the speed that drag leaves in a tick; `hold`,
-    `rub` [N, B], static and dynamic friction with the floor, doubled (`ground.py`); `present` bool [N, B]; `gravity`, m/s^2.
+    `rub` [N, B], static and dynamic friction with the floor, doubled (`ground.py`);
+    `present` bool [N, B]; `gravity`, m/s^2. To be read: `extent` [N, B, 2], how far they reach along x and z
+    since the last tick.
 
     Arguments: `half` [B, 3] (right, up, forward), `mass` [B] kg, `drag` [B] 1/s; `turns` [B]: whether
     contacts turn a body (else its yaw is only set); `room`: faces of the walls.
@@ -71,8 +75,10 @@ class SlidingBoxes:
         self.hold, self.rub = np.full(shape, BOX_FRICTION), np.full(shape, BOX_FRICTION)
         self.present = np.ones(shape, bool)
 
+        self.extent = self.half.copy()
         self._mass = np.asarray(mass, float)
         self._turns = np.asarray(turns, bool)
+        self._any_turns = bool(self._turns.any())
         self._pairs = np.array(np.triu_indices(len(mass), 1))
         self._weigh()
 
@@ -81,42 +87,37 @@ class SlidingBoxes:
         motion = self.motion
         motion[..., :2] += drive
         motion[..., :2] *= self.kept[..., None]
-        if self._turns.any():
-            motion[..., 2] = np.clip(motion[..., 2] * SPIN_KEPT, -MAX_SPIN, MAX_SPIN)
+        if self._any_turns:
+            spin = motion[..., 2] * SPIN_KEPT
+            motion[..., 2] = np.minimum(np.maximum(spin, -MAX_SPIN), MAX_SPIN)
         landed = self._land()
 
-        poses = self.poses()
-        contacts = joined(
-            [
-                pair_contacts(poses, self._pairs, motion, self._turns),
-                wall_contacts(poses, self.room, motion, self._turns),
-            ]
-        )
+        boxes, turns = self.outlines(), self._turns
+        contacts, near = pair_contacts(boxes, self._pairs, motion, turns)
+        contacts = joined(contacts, wall_contacts(boxes, self.room, motion, turns))
         solve(contacts, motion, self._weight, self._floor(landed))
 
         self.place += motion[..., :2] * TICK_S
-        self.yaw += motion[..., 2] * TICK_S
-        self._separate()
+        if self._any_turns:
+            self.yaw += motion[..., 2] * TICK_S
+        self._separate(near)
 
     def resize(self, areas: np.ndarray, body: int, half: np.ndarray) -> None:
         """Give a body of `areas` [n] other half sizes along its right and forward, [n, 2] m; mass stays."""
         self.half[areas, body] = half
         self._weigh()
 
-    def poses(self) -> Poses:
+    def outlines(self) -> Outlines:
         """Return where the boxes are, seen from above."""
-        return Poses(self.place, self.yaw, self.half, self.present)
+        return outlines(self.place, self.yaw, self.half, self._radius, self.present)
 
     def deepest(self) -> np.ndarray:
         """Return the deepest overlap of any two boxes of an area, or of a box and a wall, [N] m."""
-        poses = self.poses()
-        beyond = plan_extents(self.yaw, self.half)
-        out = np.maximum(self.room.low + beyond - self.place, self.place + beyond - self.room.high).max(
-            axis=2
-        )
-        depth: np.ndarray = np.where(self.present, out, 0.0).max(axis=1).clip(0.0)
-        area, one, other = near_pairs(poses, self._pairs, np.zeros(self.yaw.shape))
-        np.maximum.at(depth, area, -meet(poses, area, one, other).gap)
+        boxes = self.outlines()
+        beyond = np.maximum(self.room.low - self.place, self.place - self.room.high) + boxes.extent
+        depth: np.ndarray = np.where(self.present[..., None], beyond, 0.0).max(axis=(1, 2)).clip(0.0)
+        near = near_pairs(boxes, self._pairs, 0.0)
+        np.maximum.at(depth, near.area, -meet(boxes, near).gap)
         return depth
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -143,6 +144,11 @@ class SlidingBoxes:
 
     def _land(self) -> np.ndarray:
         """Fall; return the downward speed that the floor takes, [N, B] m/s."""
+        pull = self.gravity * TICK_S * self.kept
+        gap = self.height - self.rest
+        if not gap.any() and not self.fall.any():  # as nearly always
+            return pull
+
         gap = self.height - self.rest
         self.fall -= self.gravity * TICK_S
         self.fall *= self.kept
@@ -161,26 +167,31 @@ class SlidingBoxes:
         rub = self.rub * landed
         return Floor(self.hold * landed, rub, rub * self._grip)
 
-    def _separate(self) -> None:
+    def _separate(self, near: Pairs) -> None:
         """Push overlapping boxes apart, the lighter one farther, and all of them into the room."""
-        none = np.zeros(self.yaw.shape)
-        area, one, other = near_pairs(self.poses(), self._pairs, none)
-        beyond = plan_extents(self.yaw, self.half)
-        low, high = self.room.low + beyond, self.room.high - beyond
-
+        boxes = self.outlines()
+        self.extent = boxes.extent
+        low, high = self.room.low + boxes.extent, self.room.high - boxes.extent
         self._stay_inside(low, high)
-        if not area.size:
+        if not near.area.size:
             return
 
-        share = self._mass[other] / (self._mass[one] + self._mass[other])
+        widened = False
         for _ in range(PUSH_ROUNDS):
-            meeting = meet(self.poses(), area, one, other)
-            deep = np.flatnonzero(meeting.gap < -DEEP)
+            boxes.table[..., :2] = self.place
+            meeting = meet(boxes, near)
+            deep = (meeting.gap < -DEEP).nonzero()[0]
             if not deep.size:
                 break
-            way = meeting.normal[deep] * -meeting.gap[deep, None]
-            np.add.at(self.place, (area[deep], one[deep]), way * share[deep, None])
-            np.add.at(self.place, (area[deep], other[deep]), way * (share[deep, None] - 1.0))
+            if not widened and meeting.gap.min() < -FAR_IN:
+                near, widened = near_pairs(boxes, self._pairs, REACH), True
+                continue
+
+            area, one, other = near.at(deep)
+            way = (meeting.normal[:, deep] * -meeting.gap[deep]).T
+            share = (self._mass[other] / (self._mass[one] + self._mass[other]))[:, None]
+            np.add.at(self.place, (area, one), way * share)
+            np.add.at(self.place, (area, other), way * (share - 1.0))
             # Against a wall the other one gives way, in the rounds that follow.
             self._stay_inside(low, high)
 

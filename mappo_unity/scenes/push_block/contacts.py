@@ -2,7 +2,8 @@
 
 Two boxes meet along the axis that separates them best; the contact is the piece of the one's edge that faces
 the other's, by its two ends. A contact counts as far as bodies can come in the tick, so that fast ones do not
-enter each other (Unity's engine looks only 0.02 m far).
+enter each other (Unity's engine looks only 0.02 m far). Areas are few and arrays small, so vectors are kept
+by component: fewer calls are faster.
 Legend: N areas, B bodies of an area, P pairs of bodies, K pairs or bodies that are looked at closely.
 """
 
@@ -15,36 +16,56 @@ import numpy as np
 from mappo_unity.scenes.core.ground import CONTACT_GAP, TICK_S
 from mappo_unity.scenes.push_block.solver import WALL, Contacts
 
-_CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
 _NO_PAIRS = np.zeros(0, np.int64)
-_NO_POINTS = np.zeros((0, 2))
+_NO_POINTS = np.zeros((2, 0))
 _NO_CONTACTS = Contacts(_NO_PAIRS, _NO_PAIRS, _NO_PAIRS, _NO_POINTS, _NO_POINTS, _NO_POINTS, np.zeros(0))
+_CORNERS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, -1.0, 1.0]])
 
 
-class Poses(NamedTuple):
+class Outlines(NamedTuple):
     """Boxes from above: what contacts are found from."""
 
-    place: np.ndarray
-    """[N, B, 2], m: x, z of the centres."""
-    yaw: np.ndarray
-    """[N, B], rad, clockwise."""
-    half: np.ndarray
-    """[N, B, 2], m: half sizes along the boxes' own right and forward."""
+    table: np.ndarray
+    """[N, B, 6]: x, z of the centre, m; sine and cosine of the yaw; half sizes along right and forward, m."""
+    extent: np.ndarray
+    """[N, B, 2], m: how far they reach along x and z."""
+    radius: np.ndarray
+    """[N, B], m: of the circles around them."""
     present: np.ndarray
     """bool [N, B]."""
 
 
+class Pairs(NamedTuple):
+    """Pairs of bodies."""
+
+    area: np.ndarray
+    """int [K]."""
+    one: np.ndarray
+    """int [K]: body of the area."""
+    other: np.ndarray
+    """int [K]."""
+
+    def at(self, rows: np.ndarray) -> Pairs:
+        """Return some of the pairs."""
+        return Pairs(self.area[rows], self.one[rows], self.other[rows])
+
+
 class Meeting(NamedTuple):
-    """Pairs of boxes that are near, and how they face each other."""
+    """How the boxes of K pairs face each other."""
 
     gap: np.ndarray
     """[K], m: along the best separating axis; negative: depth."""
     normal: np.ndarray
-    """[K, 2]: along it, from the other to the one."""
+    """[2, K]: along it, from the other to the one."""
     axis: np.ndarray
     """int [K]: whose it is: right, forward of the other (0, 1), of the one (2, 3)."""
-    axes: np.ndarray
-    """[K, 4, 2]: all four of them."""
+    one: np.ndarray
+    other: np.ndarray
+    """[6, K]: the boxes, as in `Outlines`."""
+
+    def at(self, rows: np.ndarray) -> Meeting:
+        """Return some of the pairs."""
+        return Meeting(*(part[..., rows] for part in self))
 
 
 class Room(NamedTuple):
@@ -56,118 +77,154 @@ class Room(NamedTuple):
     """[2]: x, z."""
 
 
-def near_pairs(
-    poses: Poses, pairs: np.ndarray, reach: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give area, one and other (int [K]) of pairs [2, P] whose circles meet, enlarged by `reach` [N, B]."""
+def outlines(
+    place: np.ndarray, yaw: np.ndarray, half: np.ndarray, radius: np.ndarray, present: np.ndarray
+) -> Outlines:
+    """Return the outlines of boxes: `place`, `half` [N, B, 2], the others [N, B]."""
+    table = np.empty((*yaw.shape, 6))
+    table[..., :2], table[..., 4:] = place, half
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    table[..., 2], table[..., 3] = sin, cos
+    return Outlines(table, plan_extents(sin, cos, half), radius, present)
+
+
+def plan_extents(sin: np.ndarray, cos: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return how far boxes reach along x and z, [..., 2] m, by their yaws' sines and half sizes [..., 2]."""
+    sin, cos = np.abs(sin), np.abs(cos)
+    right, ahead = half[..., 0], half[..., 1]
+    extents = np.empty(half.shape)
+    extents[..., 0] = right * cos + ahead * sin
+    extents[..., 1] = right * sin + ahead * cos
+    return extents
+
+
+def near_pairs(boxes: Outlines, pairs: np.ndarray, reach: np.ndarray | float) -> Pairs:
+    """Return those of pairs [2, P] whose circles meet, enlarged by `reach` [N, B] or one for all, m."""
     one, other = pairs
-    if not one.size:
-        return _NO_PAIRS, _NO_PAIRS, _NO_PAIRS
-    radius = np.sqrt((poses.half**2).sum(axis=2)) + reach
-    x, z = (poses.place[:, one] - poses.place[:, other]).transpose(2, 0, 1)
-    near = x * x + z * z < (radius[:, one] + radius[:, other]) ** 2
-    near &= poses.present[:, one] & poses.present[:, other]
+    radius = boxes.radius + reach
+    x, z = boxes.table[..., 0], boxes.table[..., 1]
+    x, z = x[:, one] - x[:, other], z[:, one] - z[:, other]
+    radius = radius[:, one] + radius[:, other]
+    near = x * x + z * z < radius * radius
+    near &= boxes.present[:, one] & boxes.present[:, other]
     area, pair = near.nonzero()
-    return area, one[pair], other[pair]
+    return Pairs(area, one[pair], other[pair])
 
 
-def meet(poses: Poses, area: np.ndarray, one: np.ndarray, other: np.ndarray) -> Meeting:
-    """Find the best separating axes of pairs [K]."""
-    yaw, other_yaw = poses.yaw[area, one], poses.yaw[area, other]
-    half, other_half = poses.half[area, one].T, poses.half[area, other].T
-    sin, cos, other_sin, other_cos = np.sin(yaw), np.cos(yaw), np.sin(other_yaw), np.cos(other_yaw)
-
-    axes = np.empty((len(area), 4, 2))
-    axes[:, 0, 0], axes[:, 0, 1] = other_cos, -other_sin
-    axes[:, 1, 0], axes[:, 1, 1] = other_sin, other_cos
-    axes[:, 2, 0], axes[:, 2, 1] = cos, -sin
-    axes[:, 3, 0], axes[:, 3, 1] = sin, cos
-
-    offset = poses.place[area, one] - poses.place[area, other]
-    along = (axes @ offset[:, :, None])[:, :, 0]
+def meet(boxes: Outlines, pairs: Pairs) -> Meeting:
+    """Find the best separating axes of pairs."""
+    one, other = boxes.table[pairs.area, pairs.one].T, boxes.table[pairs.area, pairs.other].T
+    x, z, sin, cos, right, ahead = one
+    other_x, other_z, other_sin, other_cos, other_right, other_ahead = other
+    x, z = x - other_x, z - other_z
     s, c = np.abs(sin * other_cos - cos * other_sin), np.abs(cos * other_cos + sin * other_sin)
-    reach = np.empty_like(along)
-    reach[:, 0] = other_half[0] + half[0] * c + half[1] * s
-    reach[:, 1] = other_half[1] + half[0] * s + half[1] * c
-    reach[:, 2] = half[0] + other_half[0] * c + other_half[1] * s
-    reach[:, 3] = half[1] + other_half[0] * s + other_half[1] * c
 
-    gaps = np.abs(along) - reach
-    gaps[:, 2:] -= 1e-9  # of two parallel faces always the same one is taken
-    axis, rows = gaps.argmax(axis=1), np.arange(len(area))
-    sign = np.where(along[rows, axis] < 0, -1.0, 1.0)
-    return Meeting(gaps[rows, axis], axes[rows, axis] * sign[:, None], axis, axes)
+    along = np.empty((4, len(x)))
+    along[0] = x * other_cos - z * other_sin
+    along[1] = x * other_sin + z * other_cos
+    along[2] = x * cos - z * sin
+    along[3] = x * sin + z * cos
+    gaps = np.abs(along)
+    gaps[0] -= other_right + right * c + ahead * s
+    gaps[1] -= other_ahead + right * s + ahead * c
+    # Of two parallel faces always the same one is taken.
+    gaps[2] -= right + other_right * c + other_ahead * s + 1e-9
+    gaps[3] -= ahead + other_right * s + other_ahead * c + 1e-9
+
+    axis, rows = gaps.argmax(axis=0), np.arange(len(x))
+    sign = np.where(along[axis, rows] < 0, -1.0, 1.0)
+    normal = np.empty((2, len(x)))
+    normal[0] = np.array([other_cos, other_sin, cos, sin])[axis, rows] * sign
+    normal[1] = np.array([-other_sin, other_cos, -sin, cos])[axis, rows] * sign
+    return Meeting(gaps[axis, rows], normal, axis, one, other)
 
 
-def pair_contacts(poses: Poses, pairs: np.ndarray, motion: np.ndarray, turns: np.ndarray) -> Contacts:
-    """Return the contacts of pairs [2, P] of bodies.
+def pair_contacts(
+    boxes: Outlines, pairs: np.ndarray, motion: np.ndarray, turns: np.ndarray
+) -> tuple[Contacts, Pairs]:
+    """Return the contacts of pairs [2, P] of bodies, and all pairs that may overlap after the tick.
 
-    `motion` [N, B, 3]: velocity (m/s; the spin is not looked at).
-    `turns` bool [B]: which bodies contacts turn. Of a pair of others one point is enough.
+    `motion` [N, B, 3]: velocity (m/s; the spin is not looked at). `turns` bool [B]: which bodies contacts
+    turn; of a pair of others one point is enough.
     """
-    speed = np.sqrt(motion[..., 0] ** 2 + motion[..., 1] ** 2)
-    area, one, other = near_pairs(poses, pairs, speed * TICK_S + CONTACT_GAP)
-    if not area.size:
-        return _NO_CONTACTS
+    speed_x, speed_z = motion[..., 0], motion[..., 1]
+    speed = np.sqrt(speed_x * speed_x + speed_z * speed_z)
+    near = near_pairs(boxes, pairs, speed * TICK_S + CONTACT_GAP)
+    if not near.area.size:
+        return _NO_CONTACTS, near
 
-    meeting = meet(poses, area, one, other)
-
-    closing = -((motion[area, one] - motion[area, other])[:, :2] * meeting.normal).sum(axis=1)
+    meeting = meet(boxes, near)
+    approach = (motion[near.area, near.other] - motion[near.area, near.one]).T
+    closing = approach[0] * meeting.normal[0] + approach[1] * meeting.normal[1]
     reach = np.maximum(closing, 0.0) * TICK_S + CONTACT_GAP
-    near = np.flatnonzero(meeting.gap < reach)
-    if not near.size:
-        return _NO_CONTACTS
+    rows = (meeting.gap < reach + MARGIN).nonzero()[0]
+    if not rows.size:
+        return _NO_CONTACTS, near.at(rows)
+    near, meeting, reach = near.at(rows), meeting.at(rows), reach[rows]
 
-    area, one, other, reach = area[near], one[near], other[near], reach[near]
-    meeting = Meeting(*(part[near] for part in meeting))
-
-    # The ends [2, K, 2] of the touching piece, and their gaps.
-    point, gap, meets = _edge(poses, area, one, other, meeting)
-    near_end = meets & (gap < reach)
-    nearer = gap.argmin(axis=0) == np.arange(2)[:, None]
-    end, pair = (near_end & (nearer | turns[one] | turns[other])).nonzero()
-    area, one, other, point = area[pair], one[pair], other[pair], point[end, pair]
-    return Contacts(
-        area,
-        one,
-        other,
-        meeting.normal[pair],
-        point - poses.place[area, one],
-        point - poses.place[area, other],
+    point, gap, meets = _edge(meeting)
+    touches = meets & (gap < reach)
+    one_point = ~(turns[near.one] | turns[near.other])
+    touches &= ~one_point | (gap.argmin(axis=0) == _ENDS)
+    end, pair = touches.nonzero()
+    point = point[:, end, pair]
+    contacts = Contacts(
+        near.area[pair],
+        near.one[pair],
+        near.other[pair],
+        meeting.normal[:, pair],
+        point - meeting.one[:2, pair],
+        point - meeting.other[:2, pair],
         gap[end, pair],
     )
+    return contacts, near
 
 
-def wall_contacts(poses: Poses, room: Room, motion: np.ndarray, turns: np.ndarray) -> Contacts:
+MARGIN = 0.05  # m: pairs that are that much too far for a contact may still be pushed together in the tick
+_ENDS = np.array([[0], [1]])
+
+
+def wall_contacts(boxes: Outlines, room: Room, motion: np.ndarray, turns: np.ndarray) -> Contacts:
     """Return the contacts of boxes with the walls that they are near and approach: their corners.
 
     `motion`, `turns`: as in `pair_contacts`. Of a body that contacts do not turn one point is enough.
     """
     reach = np.abs(motion[..., :2]) * TICK_S + CONTACT_GAP
-    extent = plan_extents(poses.yaw, poses.half)
-    gap = np.stack([poses.place - extent - room.low, room.high - poses.place - extent])  # [2, N, B, 2]
-    near = (gap < reach) & poses.present[..., None]
+    place = boxes.table[..., :2]
+    gap = np.empty((2, *place.shape))
+    np.subtract(place - room.low, boxes.extent, out=gap[0])
+    np.subtract(room.high - place, boxes.extent, out=gap[1])
+    near = gap < reach
+    near &= boxes.present[..., None]
     side, area, body, axis = near.nonzero()
     if not area.size:
         return _NO_CONTACTS
 
-    normal = np.zeros((len(area), 2))
-    normal[np.arange(len(area)), axis] = 1.0 - 2.0 * side
+    normal = np.zeros((2, len(area)))
+    normal[axis, np.arange(len(area))] = 1.0 - 2.0 * side
     gap = gap[side, area, body, axis]
-    still = (~turns[body]).nonzero()[0]
-    parts = [_touches(area[still], body[still], normal[still], np.zeros((len(still), 2)), gap[still])]
+    turning = turns[body]
+    if not turning.any():
+        return _touches(area, body, normal, np.zeros(normal.shape), gap)
 
-    turning = turns[body].nonzero()[0]
-    if turning.size:
-        area, body, normal, gap = area[turning], body[turning], normal[turning], gap[turning]
-        arm = _corner_arms(poses.yaw[area, body], poses.half[area, body])  # [K, 4, 2]
-        along = (arm @ normal[:, :, None])[:, :, 0]
-        beyond = gap[:, None] + along - along.min(axis=1, keepdims=True)  # the gap of each corner
-        which, corner = (beyond < reach[area, body, axis[turning]][:, None]).nonzero()
-        parts.append(
-            _touches(area[which], body[which], normal[which], arm[which, corner], beyond[which, corner])
-        )
-    return joined(parts)
+    # Bodies that are not turned have one point; of the others all corners that are near.
+    arm = _corner_arms(boxes.table[area, body].T)  # [2, K, 4]
+    along = (arm * normal[:, :, None]).sum(axis=0)
+    beyond = along - along.min(axis=1, keepdims=True)  # from the nearest corner
+    arm *= turning[:, None]
+    beyond[~turning, 0], beyond[~turning, 1:] = 0.0, np.inf
+    beyond += gap[:, None]
+    which, corner = (beyond < reach[area, body, axis][:, None]).nonzero()
+    return _touches(area[which], body[which], normal[:, which], arm[:, which, corner], beyond[which, corner])
+
+
+def joined(first: Contacts, second: Contacts) -> Contacts:
+    """Return the contacts of both."""
+    if not first.area.size:
+        return second
+    if not second.area.size:
+        return first
+    return Contacts(*(np.concatenate(columns, axis=-1) for columns in zip(first, second, strict=True)))
 
 
 def _touches(
@@ -177,60 +234,47 @@ def _touches(
     return Contacts(area, body, np.full(len(area), WALL), normal, arm, arm, gap)
 
 
-def joined(parts: list[Contacts]) -> Contacts:
-    """Return the contacts of all parts."""
-    return Contacts(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-
-def plan_extents(yaw: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return how far boxes reach along x and z, [..., 2] m, by `yaw` [...] and half sizes [..., 2]."""
-    sin, cos = np.abs(np.sin(yaw)), np.abs(np.cos(yaw))
-    extents = np.empty(half.shape)
-    extents[..., 0] = half[..., 0] * cos + half[..., 1] * sin
-    extents[..., 1] = half[..., 0] * sin + half[..., 1] * cos
-    return extents
-
-
-def _edge(
-    poses: Poses, area: np.ndarray, one: np.ndarray, other: np.ndarray, meeting: Meeting
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _edge(meeting: Meeting) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the ends of the edge that faces the separating box, as far as it lies beside that one's face.
 
-    Points [2, K, 2], gaps [2, K] of them, and bool [2, K], whether there is such a piece.
+    Points [2, 2, K] (x or z, end), gaps [2, K] of them, and bool [K], whether there is such a piece.
     """
-    rows = np.arange(len(area))
     mine = meeting.axis >= 2  # the face is that of the one
-    face, edge = np.where(mine, one, other), np.where(mine, other, one)
-    out = np.where(mine, -1.0, 1.0)[:, None] * meeting.normal  # of the face
-    face_half, edge_half = poses.half[area, face], poses.half[area, edge]
-    which = meeting.axis % 2
-    first = np.where(mine, 2, 0)
-    side = meeting.axes[rows, first + 1 - which]  # along the face
+    face, edge = np.where(mine, meeting.one, meeting.other), np.where(mine, meeting.other, meeting.one)
+    out_x, out_z = np.where(mine, -1.0, 1.0) * meeting.normal  # of the face
+    across = (meeting.axis & 1).astype(bool)
+    depth, width = np.where(across, face[5], face[4]), np.where(across, face[4], face[5])
 
     # The edge is that of the box's four which looks most against the face.
-    own = meeting.axes.reshape(-1, 2, 2, 2)[rows, np.where(mine, 0, 1)]  # its axes [K, 2, 2]
-    facing = (own @ out[:, :, None])[:, :, 0]
-    axis = np.abs(facing).argmax(axis=1)
-    ahead = own[rows, axis] * -np.sign(facing[rows, axis])[:, None]
-    tangent = own[rows, 1 - axis] * edge_half[rows, 1 - axis][:, None]
-    offset = poses.place[area, edge] - poses.place[area, face]
-    middle = offset + ahead * edge_half[rows, axis][:, None]  # from the face's box
+    _, _, sin, cos, right, ahead = edge
+    facing_right, facing_ahead = cos * out_x - sin * out_z, sin * out_x + cos * out_z
+    sideways = np.abs(facing_right) > np.abs(facing_ahead)
+    sign = np.where(np.where(sideways, facing_right, facing_ahead) > 0, -1.0, 1.0)
+    look_x, look_z = sign * np.where(sideways, cos, sin), sign * np.where(sideways, -sin, cos)
+    reach, length = np.where(sideways, right, ahead), np.where(sideways, ahead, right)
+    middle_x = edge[0] - face[0] + look_x * reach  # from the face's box
+    middle_z = edge[1] - face[1] + look_z * reach
+    way_x, way_z = look_z * length, -look_x * length
 
     # Cut the edge where it leaves the strip before the face: t from -1 to 1 along it.
-    start, slope = (middle * side).sum(axis=1), (tangent * side).sum(axis=1)
+    start, slope = middle_x * out_z - middle_z * out_x, way_x * out_z - way_z * out_x
     slope = np.where(np.abs(slope) < 1e-9, 1e-9, slope)
-    width = face_half[rows, 1 - which]
-    ends = np.stack([(-width - start) / slope, (width - start) / slope])
-    low = np.maximum(np.minimum(ends[0], ends[1]), -1.0)
-    high = np.minimum(np.maximum(ends[0], ends[1]), 1.0)
-    t = np.stack([low, high])
-    point = middle + t[:, :, None] * tangent
-    gap = (point * out).sum(axis=2) - face_half[rows, which]
-    return point + poses.place[area, face], gap, np.broadcast_to(low <= high, gap.shape)
+    centre, spread = -start / slope, width / np.abs(slope)
+    t = np.empty((2, len(centre)))
+    np.maximum(centre - spread, -1.0, out=t[0])
+    np.minimum(centre + spread, 1.0, out=t[1])
+
+    point = np.empty((2, *t.shape))
+    point[0], point[1] = middle_x + t * way_x, middle_z + t * way_z
+    gap = point[0] * out_x + point[1] * out_z - depth
+    point += face[:2, None]
+    return point, gap, t[0] <= t[1]
 
 
-def _corner_arms(yaw: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return the ways from the centres to the corners, [K, 4, 2]."""
-    sin, cos = np.sin(yaw)[:, None], np.cos(yaw)[:, None]
-    right, ahead = (half[:, None] * _CORNERS).transpose(2, 0, 1)
-    return np.stack([right * cos + ahead * sin, ahead * cos - right * sin], axis=2)
+def _corner_arms(table: np.ndarray) -> np.ndarray:
+    """Return the ways from the centres of boxes [6, K] to their corners, [2, K, 4]."""
+    _, _, sin, cos, right, ahead = table[:, :, None]
+    right, ahead = right * _CORNERS[0], ahead * _CORNERS[1]
+    arms = np.empty((2, *right.shape))
+    arms[0], arms[1] = right * cos + ahead * sin, ahead * cos - right * sin
+    return arms

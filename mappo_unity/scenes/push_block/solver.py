@@ -32,11 +32,11 @@ class Contacts(NamedTuple):
     other: np.ndarray
     """int [K]: body of the area, or WALL."""
     normal: np.ndarray
-    """[K, 2]: unit vector from the other to the one."""
+    """[2, K]: unit vector (x, z) from the other to the one."""
     arm: np.ndarray
-    """[K, 2], m: from the one's centre to the point."""
+    """[2, K], m: from the one's centre to the point."""
     other_arm: np.ndarray
-    """[K, 2], m: from the other's centre to the point; anything for walls."""
+    """[2, K], m: from the other's centre to the point; anything for walls."""
     gap: np.ndarray
     """[K], m: may be closed within the tick; negative where they overlap."""
 
@@ -98,7 +98,8 @@ def solve(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Flo
 
     # All other areas have only the floor.
     touched = motion[areas]
-    motion += floor.limited(-motion)
+    if count < len(motion):
+        motion += floor.limited(-motion)
     motion[areas] = _rounds(touched, (along, across), (push, rub), (mass, rub_mass), allowed, floor.at(areas))
 
 
@@ -147,8 +148,8 @@ def _rows(
     """Return what turns motions into speeds at the contacts, [n, C, 3 B]: along the normals, across them."""
     count, width, bodies = shape
     paired = (contacts.other != WALL).nonzero()[0]
-    (x, z), (right, ahead) = contacts.normal.T, contacts.arm.T
-    other_right, other_ahead = contacts.other_arm[paired].T
+    (x, z), (right, ahead) = contacts.normal, contacts.arm
+    other_right, other_ahead = contacts.other_arm[:, paired]
     other_x, other_z = x[paired], z[paired]
 
     # Speed of a point at an arm (r_x, r_z): v_x + spin * r_z, v_z - spin * r_x.

@@ -1,0 +1,1 @@
+"""The scene CooperativePushBlock: `scene` plays it, `drawing` says how it looks."""

@@ -1,0 +1,24 @@
+"""How CooperativePushBlock looks: PushBlock's room with three agents and six blocks of three sizes."""
+
+from __future__ import annotations
+
+from mappo_unity.scenes.cooperative_push_block.scene import NUM_AGENTS, CooperativePushBlock
+from mappo_unity.scenes.core.shapes import BROWN, ORANGE, YELLOW, Camera, Drawing, Shape
+from mappo_unity.scenes.push_block.drawing import agent, block, room
+
+COLORS = (YELLOW, YELLOW, ORANGE, ORANGE, BROWN, BROWN)  # small, large, very large
+
+
+def shapes(scene: CooperativePushBlock, area: int) -> list[Shape]:
+    """Return room, goal, agents and the blocks that are still there."""
+    boxes = scene.boxes
+    drawn = room()
+    for number in range(NUM_AGENTS):
+        drawn += agent(boxes, area, number)
+    for number, color in enumerate(COLORS, NUM_AGENTS):
+        if boxes.present[area, number]:
+            drawn.append(block(boxes, area, number, color))
+    return drawn
+
+
+DRAWING = Drawing(shapes, Camera((0.0, 0.0, -0.8), 41.5, yaw=0.0, pitch=56.0))
