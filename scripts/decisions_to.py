@@ -45,7 +45,9 @@ def row(run: Path, goal: float, metric: str) -> str:
     ]
     # not every row has a value: of matches few have, and returns need episodes
     needed = EPISODES if metric == "return_mean" else 0
-    values = [line.get(metric, math.nan) if line.get("episodes", 0) >= needed else math.nan for line in metrics]
+    values = [
+        line.get(metric, math.nan) if line.get("episodes", 0) >= needed else math.nan for line in metrics
+    ]
     reached = next((line for line, value in zip(metrics, values) if value >= goal), None)
     first = f"{reached['agent_steps']:,.0f} | {reached['wall_s'] / 60:.1f}" if reached else "- | -"
     known = [value for value in values if not math.isnan(value)]
