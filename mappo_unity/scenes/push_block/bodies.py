@@ -149,7 +149,6 @@ class SlidingBoxes:
         if not gap.any() and not self.fall.any():  # as nearly always
             return pull
 
-        gap = self.height - self.rest
         self.fall -= self.gravity * TICK_S
         self.fall *= self.kept
         landed = np.maximum(-self.fall - gap / TICK_S, 0.0)

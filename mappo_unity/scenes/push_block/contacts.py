@@ -16,6 +16,8 @@ import numpy as np
 from mappo_unity.scenes.core.ground import CONTACT_GAP, TICK_S
 from mappo_unity.scenes.push_block.solver import WALL, Contacts
 
+MARGIN = 0.05  # m: pairs that are that much too far for a contact may still be pushed together in the tick
+_ENDS = np.array([[0], [1]])  # of an edge
 _NO_PAIRS = np.zeros(0, np.int64)
 _NO_POINTS = np.zeros((2, 0))
 _NO_CONTACTS = Contacts(_NO_PAIRS, _NO_PAIRS, _NO_PAIRS, _NO_POINTS, _NO_POINTS, _NO_POINTS, np.zeros(0))
@@ -178,10 +180,6 @@ def pair_contacts(
         gap[end, pair],
     )
     return contacts, near
-
-
-MARGIN = 0.05  # m: pairs that are that much too far for a contact may still be pushed together in the tick
-_ENDS = np.array([[0], [1]])
 
 
 def wall_contacts(boxes: Outlines, room: Room, motion: np.ndarray, turns: np.ndarray) -> Contacts:
