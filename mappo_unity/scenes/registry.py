@@ -61,7 +61,7 @@ _RECORDS = (
     _ours("DungeonEscape", "dungeon_escape", "DungeonEscape", (4, 8)),
     _ours("Hallway", "hallway", "Hallway", (36, 10)),
     _ours("WallJump", "wall_jump", "WallJump", (0, 6)),
-    _ours("CooperativePushBlock", "cooperative_push_block", "CooperativePushBlock", (0, 10)),
+    _ours("CooperativePushBlock", "cooperative_push_block", "CooperativePushBlock", (6, 10)),
     _ours("PushBlock", "push_block", "PushBlock", (0, 12)),
     _ours("Pyramids", "pyramids", "Pyramids", (32, 10)),
 )
