@@ -19,3 +19,8 @@ def compute_as(cfg: Config, threads: int) -> None:
     """
     torch.set_num_threads(min(threads, os.cpu_count() or 1))
     torch.set_float32_matmul_precision(cfg.matmul_precision.value)
+
+
+def cuda_number(device: str) -> int:
+    """Return N of cuda:N, 0 of cuda."""
+    return int(device.partition(":")[2] or 0)

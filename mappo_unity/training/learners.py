@@ -92,9 +92,13 @@ def _make_learner(
 
 def check_learners(cfg: Config, env: Played, learners: Mapping[str, PolicyLearner]) -> None:
     """Raise ConfigError where several learners cannot share the teams of the policies that learn."""
+    if cfg.learners == 1:
+        return
+
+    description = describe(env)
     for name, learner in learners.items():
         learner.check_joins(cfg.learners)
-        teams = describe(env).teams(name)
+        teams = description.teams(name)
         if cfg.learners > teams:
             raise ConfigError(
                 f"learners={cfg.learners} is more than the teams of {name!r}, of which each learner gets "

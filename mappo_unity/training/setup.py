@@ -23,7 +23,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.learning.networks.opponents import Opponents
 from mappo_unity.learning.ppo import PolicyLearner
-from mappo_unity.learning.torch_settings import compute_as
+from mappo_unity.learning.torch_settings import compute_as, cuda_number
 from mappo_unity.runs.logger import check_loggers
 from mappo_unity.runs.rng import seed_everything
 from mappo_unity.training.collection.batches import Batch, count_decisions
@@ -209,7 +209,7 @@ def check_device(device: str, learners: int = 1) -> None:
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if not count:
         raise ConfigError(f"device={device}: this torch finds no CUDA device; use device=cpu")
-    first = int(device.partition(":")[2] or 0)
+    first = cuda_number(device)
     if first >= count:
         raise ConfigError(f"device={device}: the last CUDA device that torch finds is cuda:{count - 1}")
     if first + learners > count:

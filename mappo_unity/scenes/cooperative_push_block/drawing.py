@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from mappo_unity.scenes.cooperative_push_block.scene import NUM_AGENTS, CooperativePushBlock
-from mappo_unity.scenes.core.shapes import BROWN, ORANGE, YELLOW, Camera, Drawing, Shape
-from mappo_unity.scenes.push_block.drawing import agent, block, room
+from mappo_unity.scenes.core.shapes import BROWN, ORANGE, YELLOW, Drawing, Shape
+from mappo_unity.scenes.push_block.drawing import CAMERA, agent, block, room
 
 COLORS = (YELLOW, YELLOW, ORANGE, ORANGE, BROWN, BROWN)  # small, large, very large
 
@@ -21,4 +21,4 @@ def shapes(scene: CooperativePushBlock, area: int) -> list[Shape]:
     return drawn
 
 
-DRAWING = Drawing(shapes, Camera((0.0, 0.0, -0.8), 41.5, yaw=0.0, pitch=56.0))
+DRAWING = Drawing(shapes, CAMERA)

@@ -15,9 +15,9 @@ from mlagents_envs.base_env import DimensionProperty
 
 from mappo_unity.scenes.cooperative_push_block import grid
 from mappo_unity.scenes.core.scene import Scene
+from mappo_unity.scenes.core.seven_actions import ACTIONS
 from mappo_unity.scenes.core.specs import Behavior, Parameter, Sensor
 from mappo_unity.scenes.push_block.agents import (
-    ACTIONS,
     AGENT_DRAG,
     AGENT_HALF,
     AGENT_MASS,

@@ -12,29 +12,14 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.scenes.core.scene import Scene
+from mappo_unity.scenes.core.seven_actions import ACTIONS
 from mappo_unity.scenes.core.specs import Behavior, Parameter, Sensor
 from mappo_unity.scenes.dungeon_escape.layout import DRAGON, KEY, LOCK, NUM_AGENTS, PORTAL
 from mappo_unity.scenes.dungeon_escape.room import DungeonRoom
 from mappo_unity.scenes.dungeon_escape.sight import EYES, see
 
 TIME_LIMIT = 15_000  # ticks since the area's reset
-RUN_SPEED = 3.0  # m/s gained in a tick
-STRAFE_SPEED = 0.75 * RUN_SPEED
-TURN_RAD = np.radians(200.0 * 0.02)  # in a tick
 DRAGON_SPEED = (1.0, 7.0)  # m/s, drawn at each reset
-
-# One row an action: gained speed ahead and to the right (m/s), turn to the right (rad), in a tick.
-ACTIONS = np.array(
-    [
-        [0.0, 0.0, 0.0],
-        [RUN_SPEED, 0.0, 0.0],
-        [-RUN_SPEED, 0.0, 0.0],
-        [0.0, 0.0, TURN_RAD],
-        [0.0, 0.0, -TURN_RAD],
-        [0.0, -STRAFE_SPEED, 0.0],
-        [0.0, STRAFE_SPEED, 0.0],
-    ]
-)
 
 
 class DungeonEscape(Scene):

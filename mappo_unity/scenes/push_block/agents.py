@@ -4,28 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from mappo_unity.scenes.core.ground import TICK_S
+from mappo_unity.scenes.core.seven_actions import ACTIONS
 
 AGENT_HALF = (0.5, 0.5, 0.5)
 AGENT_MASS, AGENT_DRAG = 10.0, 4.0  # kg, 1/s
 BLOCK_HALF_Y = 0.375
 BLOCK_DRAG = 0.5  # 1/s
-RUN_SPEED = 3.0  # m/s gained in a tick
-STRAFE_SPEED = 0.75 * RUN_SPEED
-TURN_RAD = np.radians(200.0) * TICK_S  # in a tick
-
-# One row an action: gained speed ahead and to the right (m/s), turn to the right (rad), in a tick.
-ACTIONS = np.array(
-    [
-        [0.0, 0.0, 0.0],
-        [RUN_SPEED, 0.0, 0.0],
-        [-RUN_SPEED, 0.0, 0.0],
-        [0.0, 0.0, TURN_RAD],
-        [0.0, 0.0, -TURN_RAD],
-        [0.0, -STRAFE_SPEED, 0.0],
-        [0.0, STRAFE_SPEED, 0.0],
-    ]
-)
 
 
 def drives(action: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

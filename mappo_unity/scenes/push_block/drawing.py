@@ -52,4 +52,5 @@ def block(boxes: SlidingBoxes, area: int, body: int, color: Color) -> Shape:
     return box((x, boxes.height[area, body], z), (half_x, BLOCK_HALF_Y, half_z), color, turn)
 
 
-DRAWING = Drawing(shapes, Camera((0.0, 0.0, -0.8), 41.5, yaw=0.0, pitch=56.0))
+CAMERA = Camera((0.0, 0.0, -0.8), 41.5, yaw=0.0, pitch=56.0)
+DRAWING = Drawing(shapes, CAMERA)

@@ -13,9 +13,9 @@ import numpy as np
 
 from mappo_unity.scenes.core.ground import CONTACT_GAP, TICK_S
 from mappo_unity.scenes.core.scene import Scene
+from mappo_unity.scenes.core.seven_actions import ACTIONS
 from mappo_unity.scenes.core.specs import Behavior, Parameter, Sensor
 from mappo_unity.scenes.push_block.agents import (
-    ACTIONS,
     AGENT_DRAG,
     AGENT_HALF,
     AGENT_MASS,

@@ -20,7 +20,7 @@ import torch.distributed as dist
 from mappo_unity.config.schema import Config
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.reduction import SeveralLearners
-from mappo_unity.learning.torch_settings import compute_as
+from mappo_unity.learning.torch_settings import compute_as, cuda_number
 from mappo_unity.runs.rng import get_rng_state, seed_everything, set_rng_state
 from mappo_unity.training.child_process import begin_child
 from mappo_unity.training.collection.description import Description
@@ -144,7 +144,7 @@ def device_of(cfg: Config, rank: int) -> str:
     """Return the device of a learner: with device=cuda each has one of its own."""
     if not cfg.device.startswith("cuda"):
         return cfg.device
-    return f"cuda:{int(cfg.device.partition(':')[2] or 0) + rank}"
+    return f"cuda:{cuda_number(cfg.device) + rank}"
 
 
 def _on_cpu(entries: dict[str, torch.Tensor] | None) -> dict[str, torch.Tensor] | None:

@@ -54,16 +54,21 @@ class LearnerProcesses:
             name: shares(description.teams(name), cfg.learners, team_dim(description, name))
             for name in learners
         }
+
+        # all start before anything is sent: importing torch takes seconds
         self._folder = Path(tempfile.mkdtemp(prefix="mappo-unity-"))
         meeting = str(self._folder / "meeting")
         others = range(1, cfg.learners)
         self._children = [start_child(main, (cfg, rank, meeting), f"learner-{rank}") for rank in others]
+
         try:
             whole = {name: learner.state_dict() for name, learner in learners.items()}
             parts = [self._parts(whole, rank) for rank in range(cfg.learners)]
             for rank in others:
                 known = None if generators is None else generators[rank - 1]
                 self._send(rank, "build", description, rounds, guesses_channels, parts[rank], known)
+
+            # the others meet when they have built theirs, and join after it, as this one does
             meet(cfg, 0, meeting)
             join(learners, parts[0], device_of(cfg, 0))
             self._answers()
