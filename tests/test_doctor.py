@@ -112,9 +112,9 @@ def test_a_taken_port_is_one_finding_and_no_line_of_grpc(capfd: pytest.CaptureFi
 
 def test_nothing_is_left_of_a_sound_player(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "doctor"
-    monkeypatch.setattr("mappo_unity.cli.doctor_player.tempfile.mkdtemp", lambda prefix: str(folder))
+    monkeypatch.setattr("mappo_unity.cli.examine.player.tempfile.mkdtemp", lambda prefix: str(folder))
     monkeypatch.setattr(
-        "mappo_unity.cli.doctor_player._examine_running",
+        "mappo_unity.cli.examine.player._examine_running",
         lambda report, options, game, log: log.parent.mkdir(),
     )
     (tmp_path / "Game").write_text("#!/bin/sh\n")

@@ -16,7 +16,7 @@ from fakes import vector_spec
 
 from mappo_unity.cli import player_main
 from mappo_unity.cli.player import run as main
-from mappo_unity.cli.player_log import PlayerLog
+from mappo_unity.cli.players.log import PlayerLog
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol import decode, encode, messages
 from mappo_unity.protocol.batch_encoding import varint_columns

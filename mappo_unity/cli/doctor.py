@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mappo_unity.cli.findings import CURES, Report, Say
+from mappo_unity.cli.examine.findings import CURES, Report, Say
 from mappo_unity.cli.switches import Once, Parser, number, whole_number
 from mappo_unity.config.ranges import check_duration, check_range
 from mappo_unity.errors import ConfigError
@@ -56,7 +56,7 @@ def diagnose(arguments: Sequence[str], say: Say) -> int:
 
     if options.file_name is not None or options.editor:
         # only now: most of what it says needs no player, and comes at once
-        from mappo_unity.cli.doctor_player import examine_player
+        from mappo_unity.cli.examine.player import examine_player
 
         report.head("Editor" if options.editor else "player")
         examine_player(report, options)

@@ -33,8 +33,8 @@ def run(lines: list[str]) -> int:
         from mappo_unity.policies.evaluate import evaluate
 
     result: dict[str, Any] = evaluate(where, **options, params=params)
-    from mappo_unity.cli import report
+    from mappo_unity.cli import summaries
 
-    report.console().print(report.eval_table(result))
-    print(report.json_line(result))
+    summaries.console().print(summaries.eval_table(result))
+    print(summaries.json_line(result))
     return 0

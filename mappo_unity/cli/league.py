@@ -25,19 +25,19 @@ def run(lines: list[str]) -> int:
         league = check_league(config, env_lines)
 
         # torch comes only now: mistakes in the options are told at once
-        from mappo_unity.cli import report
+        from mappo_unity.cli import summaries
         from mappo_unity.policies.league.play import play_league
         from mappo_unity.policies.league.report import write_report
         from mappo_unity.policies.league.table import Result
 
     def told(pair: tuple[str, str], results: list[Result], done: int, total: int) -> None:
-        print(report.pair_line(pair, results, done, total), flush=True)
+        print(summaries.pair_line(pair, results, done, total), flush=True)
 
     with termination_as_interrupt():
         standings, files = write_report(league, play_league(league, config.workers, told))
 
-    report.console().print(report.league_table(standings))
+    summaries.console().print(summaries.league_table(standings))
     for path in files:
         print(path)
-    print(report.json_line(standings.figures()))
+    print(summaries.json_line(standings.figures()))
     return 0

@@ -25,7 +25,7 @@ def run(lines: list[str]) -> int:
         check_film(options)
 
         # what is heavy comes only now: mistakes in the options are told at once
-        from mappo_unity.cli.report import play_line
+        from mappo_unity.cli.summaries import play_line
         from mappo_unity.viewing.play import play
 
     print(play_line(play(options)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mappo_unity.cli import player_options
+from mappo_unity.cli.players import options as player_options
 from mappo_unity.signals import interrupts_end
 
 
@@ -15,8 +15,8 @@ def run(lines: list[str]) -> int:
     """Serve or build; return the exit code: 0 when the trainer closed, 1 after an error."""
     with interrupts_end("mappo-player"):
         from mappo_unity import __version__
-        from mappo_unity.cli.player_build import build
-        from mappo_unity.cli.player_log import PlayerLog
+        from mappo_unity.cli.players.build import build
+        from mappo_unity.cli.players.log import PlayerLog
         from mappo_unity.protocol import messages
         from mappo_unity.protocol.serve import Player, env_function, serve
 

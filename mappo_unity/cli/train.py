@@ -44,7 +44,7 @@ def _train(lines: list[str], file: Path | None) -> int:
         print(launched.message)
         return 0
 
-    from mappo_unity.cli.report import run_summary
+    from mappo_unity.cli.summaries import run_summary
     from mappo_unity.config.overrides import shell_argument
 
     outcome, folder = launched.outcome, launched.folder
@@ -64,15 +64,15 @@ def _train(lines: list[str], file: Path | None) -> int:
 
 
 def _sweep(lines: list[str], file: Path | None) -> int:
-    from mappo_unity.cli import report
+    from mappo_unity.cli import summaries
     from mappo_unity.training.sweep import run_sweep
 
     result = run_sweep(lines, file)
     # the file before the table: a reader of the output that has gone must not cost it
-    report.write_csv(result)
+    summaries.write_csv(result)
 
-    console = report.console()
-    console.print(report.sweep_table(result))
+    console = summaries.console()
+    console.print(summaries.sweep_table(result))
     console.print(f"sweep folder: {result.folder}", soft_wrap=True, highlight=False)
 
     for job in result.jobs:

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from mappo_unity.cli.findings import CURES, Report
+from mappo_unity.cli.examine.findings import CURES, Report
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.protocol.ports import check_port
 

@@ -7,7 +7,7 @@ import json
 
 from rich.console import Console
 
-from mappo_unity.cli.report import eval_table, json_line
+from mappo_unity.cli.summaries import eval_table, json_line
 
 RESULT = {
     "policy": "best.pt",
