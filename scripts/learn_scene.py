@@ -72,16 +72,22 @@ def evaluate(scene: str, seed: int, folder: Path, episodes: int) -> dict[str, ob
     }
 
 
-def mappo_eval(*options: str) -> dict[str, Any]:
-    """Return what mappo-eval says, with these options."""
-    done = subprocess.run([HERE / "mappo-eval", *options], check=True, capture_output=True, text=True)
+def mappo_eval(*options: str, timeout_s: float | None = None) -> dict[str, Any]:
+    """Return what mappo-eval says, with these options; raise TimeoutExpired if it takes longer."""
+    done = subprocess.run(
+        [HERE / "mappo-eval", *options], check=True, capture_output=True, text=True, timeout=timeout_s
+    )
     said: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return said
 
 
 def results(out: Path) -> list[dict[str, str]]:
     """Return the rows of OUT/results.csv."""
-    path = out / "results.csv"
+    return read_rows(out / "results.csv")
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file; none if it is not there."""
     if not path.exists():
         return []
     with open(path, newline="") as file:

@@ -1,0 +1,176 @@
+"""The page that scripts/score_table.py writes: docs/benchmarks/scores.md and a picture of each scene."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+from learn_scene import read_rows
+from score_measures import MEASURES, Measure
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "docs/benchmarks"
+SCORES = BENCHMARKS / "scores.csv"
+CURVES = BENCHMARKS / "score_curves.csv"
+PAGE = BENCHMARKS / "scores.md"
+PICTURES = BENCHMARKS / "scores"
+FIXED = "random", "unity"
+
+HEAD = """\
+# Scores
+
+What `mappo-train env=NAME` reaches with nothing else said (options that were given stand in
+[scores.csv](scores.csv)), beside Unity's own policy in the same scene. Trained and measured by
+`scripts/score_table.py` on a share of two cores; every value is of 400 episodes or matches with the
+run's best checkpoint, sampled as it explores and, after the slash, without sampling. Values of
+seeds are separated by commas. *Reached after*: decisions and minutes at which the curve of training
+first stood at the target, for the seeds that did.
+
+Written by the script: change nothing here by hand.
+"""
+
+
+def write_page() -> None:
+    """Write the page, and the pictures where matplotlib is there."""
+    rows = read_rows(SCORES)
+    names = "scene", "measure", "target", "ours", "Unity's policy", "random", "reached after"
+    lines = [HEAD, f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+    lines += [table_row(measure, rows) for measure in MEASURES if of(measure, rows)]
+
+    missing = [measure.scene for measure in MEASURES if not of(measure, rows)]
+    if missing:
+        lines += ["", f"Not measured yet: {', '.join(dict.fromkeys(missing))}."]
+
+    drawn = draw_curves()
+    lines += [f"\n![Return of {scene} against decisions and minutes](scores/{scene}.png)" for scene in drawn]
+    PAGE.write_text("\n".join(lines) + "\n")
+
+
+def of(measure: Measure, rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    """Return the rows of a measure."""
+    return [row for row in rows if (row["scene"], row["measure"]) == (measure.scene, measure.name)]
+
+
+def table_row(measure: Measure, rows: list[dict[str, str]]) -> str:
+    """Return the row of the table that compares a measure's policies."""
+    own = of(measure, rows)
+    seeds = [row for row in own if row["policy"] not in FIXED]
+    cells = [
+        *(measure.scene, measure.name, f"{'<=' if measure.is_lower_better else '>='} {measure.target:g}"),
+        both_ways(seeds),
+        *(both_ways([row for row in own if row["policy"] == player]) for player in reversed(FIXED)),
+        reached_after(measure),
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def both_ways(rows: list[dict[str, str]]) -> str:
+    """Return the mean over policies and their values, sampled and without sampling."""
+    texts = []
+    for sampled in ("True", "False"):
+        values = [float(row["value"]) for row in rows if row["sampled"] == sampled]
+        if len(values) == 1:
+            texts.append(f"{values[0]:.3g}")
+        elif values:
+            texts.append(f"**{statistics.mean(values):.3g}** ({', '.join(f'{v:.3g}' for v in values)})")
+    return " / ".join(texts) or "-"
+
+
+def reached_after(measure: Measure) -> str:
+    """Return the decisions and minutes after which each seed's curve stood at the target first."""
+    if measure.opponent == "unity":  # no run plays against it while it learns
+        return "-"
+
+    reached = []
+    for points in curves_of(measure.scene, measure.column).values():
+        first = next((point for point in points if measure.is_reached(point[2])), None)
+        if first is not None:
+            reached.append(f"{first[0] / 1e6:.2f} M, {first[1]:.1f} min")
+    return "; ".join(reached) or "-"
+
+
+Point = tuple[float, float, float]
+"""Decisions, minutes, value."""
+
+
+def curves_of(scene: str, column: str) -> dict[str, list[Point]]:
+    """Return the curves of a scene's seeds."""
+    curves: dict[str, list[Point]] = defaultdict(list)
+    for row in read_rows(CURVES):
+        if (row["scene"], row["column"]) == (scene, column):
+            point = float(row["decisions"]), float(row["minutes"]), float(row["value"])
+            curves[row["seed"]].append(point)
+    return curves
+
+
+def draw_curves() -> list[str]:
+    """Draw a picture for each scene that has curves; return those scenes, or none without matplotlib."""
+    try:
+        import matplotlib
+    except ImportError:
+        print("the pictures need matplotlib: pip install matplotlib, then --draw")
+        return sorted(path.stem for path in PICTURES.glob("*.png"))
+    matplotlib.use("Agg")
+
+    PICTURES.mkdir(exist_ok=True)
+    drawn = []
+    for scene in dict.fromkeys(measure.scene for measure in MEASURES):
+        measures = list({m.column: m for m in MEASURES if m.scene == scene}.values())
+        shown = [measure for measure in measures if curves_of(scene, measure.column)]
+        if shown:
+            draw_scene(scene, shown, PICTURES / f"{scene}.png")
+            drawn.append(scene)
+    return drawn
+
+
+def draw_scene(scene: str, measures: list[Measure], path: Path) -> None:
+    """Draw a row of two panels for each measure: against decisions, and against minutes."""
+    from matplotlib import pyplot
+
+    rows = read_rows(SCORES)
+    figure, axes = pyplot.subplots(
+        *(len(measures), 2), figsize=(8, 2.9 * len(measures)), layout="constrained", squeeze=False
+    )
+    for measure, (left, right) in zip(measures, axes):
+        curves = curves_of(scene, measure.column)
+        for axis, place, label in ((left, 0, "million decisions"), (right, 1, "minutes")):
+            scale = 1e6 if place == 0 else 1.0
+            draw_seeds(axis, [[(p[place] / scale, p[2]) for p in points] for points in curves.values()])
+            draw_levels(axis, measure, of(measure, rows))
+            axis.set(xlabel=label)
+            axis.grid(alpha=0.3)
+        left.set(ylabel=measure.column.replace("_", " "), title=scene)
+        right.legend(fontsize="small")
+    figure.savefig(path, dpi=80)
+    pyplot.close(figure)
+
+
+def draw_seeds(axis: Any, curves: list[list[tuple[float, float]]]) -> None:
+    """Draw every seed thin, and their mean with its spread where all of them have values."""
+    import numpy as np
+
+    for points in curves:
+        axis.plot(*zip(*points), color="tab:blue", linewidth=0.8, alpha=0.6)
+    if len(curves) < 2:
+        return
+
+    start, end = max(c[0][0] for c in curves), min(c[-1][0] for c in curves)
+    at = np.linspace(start, end, 100)
+    values = np.array([np.interp(at, *zip(*points)) for points in curves])
+    mean, spread = values.mean(0), values.std(0)
+    axis.plot(at, mean, color="tab:blue", linewidth=2, label=f"mean of {len(curves)} seeds")
+    axis.fill_between(at, mean - spread, mean + spread, color="tab:blue", alpha=0.15, linewidth=0)
+
+
+def draw_levels(axis: Any, measure: Measure, rows: list[dict[str, str]]) -> None:
+    """Draw lines at the target, at Unity's policy and at random play."""
+    axis.axhline(measure.target, color="tab:green", linestyle="--", linewidth=1, label="target")
+    if measure.opponent is not None:
+        return
+    for player, color in (("unity", "tab:orange"), ("random", "gray")):
+        values = [float(r["value"]) for r in rows if r["policy"] == player and r["sampled"] == "True"]
+        if values and not math.isnan(values[0]):
+            label = {"unity": "Unity's policy"}.get(player, player)
+            axis.axhline(values[0], color=color, linestyle=":", linewidth=1.2, label=label)

@@ -1,0 +1,208 @@
+#!/usr/bin/env python3
+"""Train presets over seeds, measure their best checkpoints, and write the table of scores.
+
+A run lies in OUT/SCENE-SEED and is resumed after any interruption; one that has spent its minutes is ended
+and measured as it stands. What was measured is appended to docs/benchmarks/scores.csv after every run, and
+its curve to score_curves.csv, so that no hour of work is lost; what stands there is not run again. Unity's
+own policies (ONNX files named after their behaviors, in one folder) and random play are measured once.
+
+    python scripts/score_table.py Hallway Basic [--seeds 0 1 2] [--minutes 120] [--unity FOLDER] [OPTION ...]
+    python scripts/score_table.py --draw                      # only scores.md and the pictures
+
+OPTIONs of mappo-train are noted with the run. The pictures need matplotlib.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+from learn_scene import HERE, append, mappo_eval, read_rows
+from score_measures import MEASURES, Measure, measures_of
+from score_page import CURVES, SCORES, write_page
+
+from mappo_unity.runs.metrics_csv import read_metrics
+
+POINTS = 60  # of a curve
+EVALUATION_S = 900  # a policy that stands still in a scene without a time limit would play for ever
+
+
+def main() -> None:
+    """Measure what is missing, then write the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("words", nargs="*", metavar="SCENE|OPTION")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--minutes", type=float, default=120.0, help="of collecting and learning, for a run")
+    parser.add_argument("--episodes", type=int, default=400, help="of each evaluation")
+    parser.add_argument("--out", type=Path, default=Path("outputs/scores"))
+    parser.add_argument("--unity", type=Path, help="folder of Unity's own policies, BEHAVIOR.onnx")
+    parser.add_argument("--draw", action="store_true", help="run nothing")
+    arguments = parser.parse_intermixed_args()
+
+    known = {measure.scene for measure in MEASURES}
+    options = [word for word in arguments.words if "=" in word]
+    scenes = [word for word in arguments.words if "=" not in word]
+    for scene in scenes:
+        if scene not in known:
+            parser.error(f"{scene}: there is no such scene; there are {', '.join(sorted(known))}")
+
+    if not arguments.draw:
+        for scene in scenes or sorted(known):
+            measure_fixed(arguments, scene)
+            for seed in arguments.seeds:
+                measure_seed(arguments, scene, seed, options)
+
+    write_page()
+
+
+def measure_fixed(arguments: argparse.Namespace, scene: str) -> None:
+    """Measure random play and Unity's policy in a scene, unless that has been done."""
+    players = {"random": "random"}
+    if arguments.unity is not None and has_policies(arguments.unity, scene):
+        players["unity"] = str(arguments.unity.resolve())
+
+    for player, run in players.items():
+        if not is_measured(scene, player):
+            score(arguments, scene, player, [f"run={run}", f"env={scene}"], {})
+
+
+def has_policies(folder: Path, scene: str) -> bool:
+    """Return whether a folder has a file for every behavior of a scene."""
+    from mappo_unity.keys import policy_name
+    from mappo_unity.scenes.registry import make_scene
+
+    env = make_scene(scene, num_areas=1)
+    try:
+        env.reset()
+        return all((folder / f"{policy_name(name)}.onnx").is_file() for name in env.behavior_specs)
+    finally:
+        env.close()
+
+
+def measure_seed(arguments: argparse.Namespace, scene: str, seed: int, options: list[str]) -> None:
+    """Train a seed to its end or through its minutes, and measure it, unless that has been done."""
+    if is_measured(scene, str(seed)):
+        return
+
+    folder = arguments.out / f"{scene}-{seed}"
+    load = os.getloadavg()[0]
+    train(scene, seed, folder, arguments.minutes, options)
+
+    metrics = read_metrics(folder / "metrics.csv")
+    facts = {
+        "decisions": metrics[-1]["agent_steps"],
+        "minutes": f"{float(metrics[-1]['wall_s']) / 60:.1f}",
+        "options": " ".join(options),
+        "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
+    }
+    for measure in {measure.column: measure for measure in measures_of(scene)}.values():
+        append_curve(measure, seed, metrics)
+    score(arguments, scene, str(seed), [f"run={folder}"], facts)
+
+
+def train(scene: str, seed: int, folder: Path, minutes: float, options: list[str]) -> None:
+    """Train until the run ends or has spent its minutes; a run that stands is resumed."""
+    spent_s = 0.0
+    lines = [f"env={scene}", f"seed={seed}", f"hydra.run.dir={folder}", *options]
+    if (folder / "checkpoints").is_dir():
+        lines = [f"resume={folder}"]
+        spent_s = float(read_metrics(folder / "metrics.csv")[-1]["wall_s"])
+    left_s = minutes * 60 - spent_s
+    if left_s <= 0:
+        return
+
+    process = subprocess.Popen([HERE / "mappo-train", *lines])
+    try:
+        code = process.wait(left_s)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGTERM)  # which saves
+        process.wait()
+        return
+    except BaseException:
+        process.send_signal(signal.SIGTERM)
+        process.wait()
+        raise
+    if code not in (0, 4):  # 4: ended, but most updates were rolled back
+        raise SystemExit(f"mappo-train {' '.join(lines)}: exit code {code}")
+
+
+def score(
+    arguments: argparse.Namespace, scene: str, player: str, policy: list[str], facts: dict[str, Any]
+) -> None:
+    """Evaluate a policy sampled and without sampling; append a row for each measure."""
+    for deterministic in (False, True):
+        said: dict[str | None, dict[str, Any] | None] = {}
+        for measure in measures_of(scene):
+            if measure.opponent not in said:
+                said[measure.opponent] = evaluate(arguments, measure, player, policy, deterministic)
+            figures = said[measure.opponent]
+            if figures is None:
+                continue
+            value, stderr = measure.figure(figures)
+            row = {
+                "date": time.strftime("%Y-%m-%d"),
+                "scene": scene,
+                "measure": measure.name,
+                "policy": player,
+                "sampled": not deterministic,
+                "value": f"{value:.4g}",
+                "stderr": f"{stderr:.2g}",
+                "episodes": arguments.episodes,
+                **{name: facts.get(name, "") for name in ("decisions", "minutes", "options", "load")},
+            }
+            append(SCORES, row)
+            print(row, flush=True)
+
+
+def evaluate(
+    arguments: argparse.Namespace, measure: Measure, player: str, policy: list[str], deterministic: bool
+) -> dict[str, Any] | None:
+    """Return what mappo-eval says of a policy; None where it cannot be measured."""
+    lines = [*policy, f"episodes={arguments.episodes}", f"deterministic={str(deterministic).lower()}"]
+    if measure.opponent == "unity":
+        if arguments.unity is None or player == "unity":
+            return None
+        lines.append(f"opponent={arguments.unity.resolve()}")
+    elif measure.opponent is not None:
+        lines.append(f"opponent={measure.opponent}")
+
+    if player == "random" and (deterministic or measure.opponent == "unity"):
+        return None
+    try:
+        return mappo_eval(*lines, timeout_s=EVALUATION_S)
+    except subprocess.TimeoutExpired:
+        print(f"{measure.scene}, {player}: no {arguments.episodes} episodes in {EVALUATION_S} s", flush=True)
+        return None
+
+
+def is_measured(scene: str, player: str) -> bool:
+    """Return whether every measure of a scene stands in the table for a policy."""
+    return any(row["scene"] == scene and row["policy"] == player for row in read_rows(SCORES))
+
+
+def append_curve(measure: Measure, seed: int, metrics: list[dict[str, str]]) -> None:
+    """Append a run's curve, thinned out, in decisions and minutes."""
+    known = [row for row in metrics if row.get(measure.column) and row[measure.column] != "nan"]
+    step = max(1, math.ceil(len(known) / POINTS))
+    for row in [*known[::step], *known[-1:]]:
+        point = {
+            "scene": measure.scene,
+            "column": measure.column,
+            "seed": seed,
+            "decisions": row["agent_steps"],
+            "minutes": f"{float(row['wall_s']) / 60:.2f}",
+            "value": f"{float(row[measure.column]):.4g}",
+        }
+        append(CURVES, point)
+
+
+if __name__ == "__main__":
+    main()
