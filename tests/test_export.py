@@ -266,7 +266,7 @@ def test_mappo_eval_plays_an_onnx_file_as_its_checkpoint(tiny_run, tmp_path, cap
     assert eval_main([f"run={elsewhere}"]) == 2
     assert "env=3DBall (3DBall" in capsys.readouterr().err
     assert eval_main([f"run={best}.pt", "opponent=nowhere"]) == 2
-    assert "opponent=nowhere does not exist: give random, a run folder" in capsys.readouterr().err
+    assert "opponent=nowhere does not exist: give random, zoo, a run folder" in capsys.readouterr().err
 
 
 @pytest.mark.slow

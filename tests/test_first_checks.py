@@ -109,7 +109,7 @@ TOLD = [
     ("eval run=other.pt", "other.pt is a file of torch, but no checkpoint of mappo-unity"),
     (
         "eval run=text.txt",
-        "is neither a checkpoint nor an ONNX file: give random, a run folder, a checkpoint",
+        "is neither a checkpoint nor an ONNX file: give random, zoo, a run folder, a checkpoint",
     ),
     ("eval run=junk.onnx env=3DBall", "junk.onnx is no ONNX model that onnxruntime can run"),
     ("eval run=nothing", "run=nothing holds no policy: that folder has none of checkpoints/best.pt"),
@@ -155,7 +155,7 @@ TOLD = [
     ),
     ("league soccer", "a league needs two policies or more, and has soccer: name them before the options"),
     ("league", "a league needs two policies or more, and has none"),
-    ("league soccer nowhere", "policy=nowhere does not exist: give random, a run folder"),
+    ("league soccer nowhere", "policy=nowhere does not exist: give random, zoo, a run folder"),
     ("league soccer soccer", "the policy soccer plays twice: name each policy once"),
     ("league random random env=SoccerTwos", "the policy random plays twice"),
     ("league soccer soccer/checkpoints/best.pt", "plays as soccer and as soccer/checkpoints/best.pt, both"),

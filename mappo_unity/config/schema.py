@@ -696,7 +696,7 @@ class SelfPlayConfig:
     num_opponents: int = 3
     """Past opponents that are met at the same time, at most; each costs a forward pass a round."""
     fixed: list[str] = field(default_factory=list)
-    """Opponents that are always in the pool: random, run folders, checkpoints, ONNX files."""
+    """Opponents that are always in the pool: random, zoo, run folders, checkpoints, ONNX files."""
     skip_missing: bool = False
     """With resume: go on without snapshots whose files are missing or damaged."""
 
@@ -896,11 +896,11 @@ class EvalConfig:
     """Options of an evaluation."""
 
     run: str = "???"
-    """Run folder (its best checkpoint is played), checkpoint file or ONNX file; must be given."""
+    """Run folder (its best checkpoint is played), checkpoint, ONNX file or zoo; must be given."""
     episodes: int = 100
     """Agent episodes to play; matches, when there is an opponent."""
     opponent: Optional[str] = None
-    """Play matches, both sides in turn, against random, or another run folder, checkpoint or ONNX file."""
+    """Play matches, both sides in turn, against random, zoo, a run folder, checkpoint or ONNX file."""
     deterministic: bool = False
     """Take the most likely action instead of a sampled one."""
     seed: int = 0
@@ -919,7 +919,7 @@ class LeagueConfig:
     """Options of a league."""
 
     policies: list[str] = field(default_factory=list)
-    """Who plays: random, run folders (best checkpoints), checkpoints, ONNX files; words before options."""
+    """Who plays: random, zoo, run folders (best checkpoints), checkpoints, ONNX files; before options."""
     env: Optional[str] = None
     """Environment, a preset in conf/env; null: that of the first run. env.NAME=... sets its options."""
     matches: int = 100
@@ -971,7 +971,8 @@ class PlayConfig:
     env: Optional[str] = None
     """Environment to play in, a preset in conf/env; null: that of the run."""
     policy: Optional[str] = None
-    """With env: an ONNX file, or a folder with NAME.onnx for each behavior; null: random actions."""
+    """With env: zoo (trained policies that the package brings), an ONNX file, or a folder with NAME.onnx for
+    each behavior; null: random actions."""
     video: Optional[str] = None
     """File to write, NAME.mp4 or NAME.gif; null: a window on the display, or with record nothing."""
     record: Optional[str] = None

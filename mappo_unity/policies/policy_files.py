@@ -29,8 +29,11 @@ from mappo_unity.runs.checkpoint_file import (
 from mappo_unity.runs.folder import CONFIG, check_there, runs_below
 
 RANDOM = "random"
+ZOO = "zoo"
+ZOO_FOLDER = Path(__file__).resolve().parents[1] / "zoo"
+"""The trained policies that the package brings, BEHAVIOR.onnx each."""
 SUFFIX = ".onnx"
-PLAYABLE = "random, a run folder, a checkpoint (.pt) or an ONNX file"
+PLAYABLE = "random, zoo, a run folder, a checkpoint (.pt) or an ONNX file"
 
 logger = logging.getLogger(__name__)
 
@@ -63,6 +66,8 @@ def locate(where: str, option: str, wanted: str = PLAYABLE) -> Source:
     path = Path(where)
     if where == RANDOM:
         return Source(Kind.random, path, option)
+    if where == ZOO:
+        return Source(Kind.onnx_folder, ZOO_FOLDER, option)
 
     check_there(path, option, f": give {wanted}")
     if path.is_dir():
