@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+import textwrap
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ def write_page() -> None:
 
     missing = [measure.scene for measure in MEASURES if not of(measure, rows)]
     if missing:
-        lines += ["", f"Not measured yet: {', '.join(dict.fromkeys(missing))}."]
+        lines += ["", textwrap.fill(f"Not measured yet: {', '.join(dict.fromkeys(missing))}.", 100)]
 
     drawn = draw_curves()
     lines += [f"\n![Return of {scene} against decisions and minutes](scores/{scene}.png)" for scene in drawn]
