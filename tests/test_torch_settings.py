@@ -1,4 +1,4 @@
-"""The precision of matrix products: set wherever a policy acts or learns, and taken back by the next run."""
+"""How torch computes: the precision of products, wherever a policy acts or learns, and compiled updates."""
 
 from __future__ import annotations
 
@@ -56,3 +56,34 @@ def test_another_precision_is_refused() -> None:
     with pytest.raises(ConfigError, match="matmul_precision") as error:
         options("matmul_precision=low")
     assert "highest, high, medium" in str(error.value)
+
+
+@pytest.mark.slow
+def test_a_compiled_update_is_the_same_to_rounding(tmp_path: Path) -> None:
+    lines = [*LINES, "ppo.minibatch_size=16", "ppo.epochs=2", "seed=3"]
+    parameters = []
+    for compile_ in ("false", "true"):
+        with set_up(options(*lines, f"ppo.compile={compile_}"), tmp_path / compile_) as setup:
+            before = [p.detach().clone() for p in setup.learners["3DBall"].params]
+            with setup.collecting() as batches:
+                metrics = setup.learn(next(batches), 0.0)["3DBall"]
+            assert metrics["rolled_back"] == 0.0
+            after = setup.learners["3DBall"].params
+            assert any((p - old).abs().max() > 1e-4 for p, old in zip(after, before))
+            parameters.append([p.detach().clone() for p in after])
+
+    for plain, compiled in zip(*parameters):
+        torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-5)
+
+
+def test_memories_are_not_compiled(tmp_path: Path, capsys: Any) -> None:
+    lines = ["env=Hallway", "env.num_areas=2", "ppo.compile=true", f"hydra.run.dir={tmp_path}", *SMALL]
+    assert train_main(lines) == 2
+    assert "ppo.compile=true does not go with the memory of 'Hallway'" in capsys.readouterr().err
+
+
+def test_a_cpu_without_a_compiler_compiles_nothing(tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    assert train_main([*LINES, "ppo.compile=true", f"hydra.run.dir={tmp_path}"]) == 2
+    error = capsys.readouterr().err
+    assert "there is no no-such-compiler" in error and "g++" in error

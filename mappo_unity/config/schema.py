@@ -459,6 +459,9 @@ class PPOConfig:
     """Stop an update's remaining epochs when the approximate KL exceeds this; null: never."""
     max_kl: float = 1.0
     """Roll an update back when the approximate KL exceeds this or a number is not finite."""
+    compile: bool = False
+    """Let torch.compile compile the networks for the update, which takes half a minute at the start; not
+    with model.memory. Meant for GPUs: on a CPU it gains little."""
 
     def __post_init__(self) -> None:
         _above("ppo.lr", self.lr, 0)

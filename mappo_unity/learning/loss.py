@@ -6,10 +6,12 @@ memories need another one, and TorchRL's wrappers cost more than small networks 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 from torchrl.objectives import ClipPPOLoss
 
@@ -21,6 +23,7 @@ from mappo_unity.learning.networks.distributions import ActionDistribution
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import RecurrentCritic
 from mappo_unity.learning.reduction import ALONE, Reduction
+from mappo_unity.learning.torch_settings import compiled
 from mappo_unity.learning.value_norm import ValueNorm
 
 ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: it acted, and the outcome is known; absent: all
@@ -67,6 +70,8 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         self.reduction: Reduction = ALONE
         self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
         self._actor, self._critic = actor, critic.module
+        self._policy: Callable[..., Tensor] = compiled(actor.module[0].module.forward, cfg.compile)
+        self._value: Callable[..., Tensor] = compiled(value_method(critic.module), cfg.compile)
         self.critic_keys = [str(key) for key in critic.in_keys]
         self.log_ratio = self.ratio = self.entropy = torch.zeros(())
 
@@ -108,7 +113,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
     def _distribution(self, rows: TensorDictBase) -> ActionDistribution:
         obs = [rows.get(key) for key in self._actor.obs_keys]
         net = self._actor.module[0].module
-        params = net.unroll(*obs, rows.get(keys.MEMORY)) if self._actor.has_memory else net(*obs)
+        params = net.unroll(*obs, rows.get(keys.MEMORY)) if self._actor.has_memory else self._policy(*obs)
         mask = rows.get(keys.MASK) if self._actor.layout.branches else None
         return ActionDistribution(params, self._actor.layout, mask)
 
@@ -158,9 +163,9 @@ class MaskedClipPPOLoss(ClipPPOLoss):
             return critic.unroll(inputs, action, rows.get(MEMBER), rows)
 
         inputs = [rows.get(key) for key in self.critic_keys]
-        if not isinstance(critic, PocaCritic):
-            return critic(*inputs), None
-        return critic.value(*inputs), critic.baseline(*inputs, rows.get(keys.ACTION))
+        value = self._value(*inputs)
+        has_baseline = isinstance(critic, PocaCritic)
+        return value, critic.baseline(*inputs, rows.get(keys.ACTION)) if has_baseline else None
 
     def _distance(self, value: Tensor, target: Tensor, old: Tensor | None, clip: float) -> Tensor:
         """Return distances ``[..., 1]`` of values ``[..., V]``: the mean over reward streams (ML-Agents)."""
@@ -173,6 +178,11 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         if self.cfg.value_loss is ValueLoss.huber:
             return huber_loss(value, target, reduction="none", delta=self.cfg.huber_delta)
         return (value - target) ** 2
+
+
+def value_method(critic: nn.Module) -> Callable[..., Tensor]:
+    """Return what gives a critic's values for rows: a POCA critic has two outputs."""
+    return critic.value if isinstance(critic, PocaCritic) else critic.forward
 
 
 def _where(mask: Tensor | None, log_ratio: Tensor) -> Tensor:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Callable
 
 import torch
+from torch import nn
 
 from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
 
 
 def compute_as(cfg: Config, threads: int) -> None:
@@ -24,3 +28,28 @@ def compute_as(cfg: Config, threads: int) -> None:
 def cuda_number(device: str) -> int:
     """Return N of cuda:N, 0 of cuda."""
     return int(device.partition(":")[2] or 0)
+
+
+def compiled(method: Callable, is_wanted: bool) -> Callable:
+    """Return a network's method, compiled when it is called first (`ppo.compile`), or as it is.
+
+    The method of a network, not the network: parameters and their names stay as they are.
+    """
+    # minibatches differ by a row or two: without dynamic shapes each size would be compiled
+    return torch.compile(method, dynamic=True) if is_wanted else method
+
+
+def check_compiles(name: str, actor: nn.Module, device: str) -> None:
+    """Raise ConfigError where `ppo.compile` cannot compile a policy's networks for its update."""
+    if getattr(actor, "has_memory", False):
+        raise ConfigError(
+            f"ppo.compile=true does not go with the memory of {name!r}, which is unrolled step by step; "
+            f"leave it out, or behaviors.{name}.ppo.compile=false"
+        )
+
+    compiler = os.environ.get("CXX", "c++")
+    if device == "cpu" and shutil.which(compiler) is None:
+        raise ConfigError(
+            f"ppo.compile=true needs a C++ compiler on the CPU, and there is no {compiler}: install one "
+            "(Debian: g++), name it by the environment variable CXX, or leave ppo.compile out"
+        )

@@ -18,6 +18,7 @@ from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.networks.images import check_sides
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.rewards.streams import RewardStreams, make_intrinsic
+from mappo_unity.learning.torch_settings import check_compiles
 from mappo_unity.scenes.contract.images import looks_unmarked
 from mappo_unity.training.collection.description import Played, describe
 from mappo_unity.training.memory import check_batch_memory, check_network_memory
@@ -74,6 +75,8 @@ def _make_learner(
 ) -> PolicyLearner:
     model, ppo, rewards, bc = behavior_config(cfg, name)
     actor = make_actor(obs, layout, team_size, model).to(cfg.device)
+    if ppo.compile:
+        check_compiles(name, actor, cfg.device)
 
     def expert(demos: list[str]) -> Expert:
         return make_expert(read_fitting(demos, spec, name), obs.keys, cfg.device)
