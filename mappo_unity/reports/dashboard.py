@@ -126,9 +126,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with the page, its data, or nothing."""
-        # a page elsewhere whose name was pointed at this address must not read a run
-        hosts = [f"{name}:{self.server.server_port}" for name in (HOST, "localhost")]
-        if self.headers.get("Host") not in hosts:
+        # A page elsewhere whose name was pointed at this address must not read a run. The port may be another
+        # one, that of a tunnel.
+        host = (self.headers.get("Host") or "").partition(":")[0]
+        if host not in (HOST, "localhost"):
             self._answer(403, "text/plain", b"")
         elif self.path == "/":
             from mappo_unity.reports.page import live_page

@@ -144,7 +144,7 @@ class Chart {
 
   draw() {
     const width = this.node.clientWidth;
-    if (!width) return; // folded away
+    if (!width || !this.node.closest("details").open) return; // folded away
     this.width = width;
     this.svg.replaceChildren();
     this.svg.setAttribute("viewBox", `0 0 ${width} ${HEIGHT}`);

@@ -16,8 +16,9 @@ from mappo_unity.reports.reading import Run
 from mappo_unity.reports.sections import figure, last
 
 _MOST = 8  # axes of options
+_LETTERS, _LINE = 18, 14  # of a text; pixels from one line of text to the next
 _HEIGHT, _TOP, _BOTTOM, _SIDE = 280, 34, 20, 60  # pixels
-_WIDTH, _GAPS = 620, (130, 300)  # pixels that the axes share; the least and the most between two
+_WIDTH, _GAPS = 620, (130, 220)  # pixels that the axes share; the least and the most between two
 
 
 def parallel_coordinates(runs: Sequence[Run]) -> str:
@@ -37,7 +38,7 @@ def parallel_coordinates(runs: Sequence[Run]) -> str:
     order = sorted(range(len(runs)), key=lambda number: (math.isfinite(returns[number]), returns[number]))
     names = run_names(runs)
     lines = [_line(axes, places, number, names[number], axes[-1].share(number)) for number in order]
-    body = "".join([*lines, *(axis.drawing(x) for axis, x in zip(axes, places))])
+    body = "".join([*lines, *(axis.drawing(x, axis is axes[0]) for axis, x in zip(axes, places))])
     view = f"viewBox='0 0 {width} {_HEIGHT}' width='{width}' height='{_HEIGHT}'"
     return f"<div class='wide'><svg class='parallel' {view} role='img'>{body}</svg></div>"
 
@@ -74,23 +75,30 @@ class _Axis:
         """Return where a run's value lies, in pixels from the top."""
         return round(_HEIGHT - _BOTTOM - self.share(number) * (_HEIGHT - _TOP - _BOTTOM), 1)
 
-    def drawing(self, x: float) -> str:
-        """Return the axis with its name and the values on it that do not cover one another."""
+    def drawing(self, x: float, is_first: bool) -> str:
+        """Return the axis with its name and the values beside it that do not cover one another."""
         parts = [f"<line class='axis' x1='{x}' x2='{x}' y1='{_TOP}' y2='{_HEIGHT - _BOTTOM}'/>"]
         parts.append(
             f"<text class='head' x='{x}' y='16' text-anchor='middle'>{escape(_short(self.name))}</text>"
         )
-        taken: list[float] = []
-        numbers = [number for number in range(len(self._texts)) if math.isfinite(self._values[number])]
-        # the ends first: they say what the axis spans
-        for number in sorted(numbers, key=lambda number: -abs(self.share(number) - 0.5)):
-            y = self.place(number)
-            if all(abs(y - other) >= 14 for other in taken):
-                taken.append(y)
-                value = _number(self._texts[number])
-                text = self._texts[number] if value is None else figure(value)
-                parts.append(f"<text class='value' x='{x + 5}' y='{y + 4}'>{escape(_short(text))}</text>")
+        # outside of the lines, where there is an outside
+        side = f"x='{x - 5}' text-anchor='end'" if is_first else f"x='{x + 5}'"
+        letters = _SIDE // 7 if is_first else _LETTERS
+        for number in self._apart():
+            value = _number(self._texts[number])
+            text = self._texts[number] if value is None else figure(value)
+            y = self.place(number) + 4
+            parts.append(f"<text class='value' {side} y='{y:g}'>{escape(_short(text, letters))}</text>")
         return "".join(parts)
+
+    def _apart(self) -> list[int]:
+        """Return runs whose values have room for a line of text each, the ends of the axis first."""
+        numbers = [number for number in range(len(self._texts)) if math.isfinite(self._values[number])]
+        apart: list[int] = []
+        for number in sorted(numbers, key=lambda number: -abs(self.share(number) - 0.5)):
+            if all(abs(self.place(number) - self.place(other)) >= _LINE for other in apart):
+                apart.append(number)
+        return apart
 
 
 def _line(axes: Sequence[_Axis], places: Sequence[int], number: int, name: str, share: float) -> str:
@@ -111,5 +119,5 @@ def _number(text: str) -> float | None:
         return None
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= 18 else "…" + text[-17:]
+def _short(text: str, letters: int = _LETTERS) -> str:
+    return text if len(text) <= letters else "…" + text[1 - letters :]

@@ -36,11 +36,14 @@ def outcome(runs: Sequence[Run]) -> str:
         )
         return f"<dl class='facts'>{''.join(facts)}</dl>"
 
+    # the options beside the return, which they are read with
     rows = [
-        [name, *(one[key] for key in keys), *row] for name, one, row in zip(run_names(runs), values, figures)
+        [name, row[0], *(one[key] for key in keys), *row[1:]]
+        for name, one, row in zip(run_names(runs), values, figures)
     ]
+    heads = ["run", heads[0], *keys, *heads[1:]]
     order = sorted(range(len(runs)), key=lambda number: _from_best(runs[number]))
-    return table(["run", *keys, *heads], [rows[number] for number in order], 1 + len(keys))
+    return table(heads, [rows[number] for number in order], 1)
 
 
 def timing(runs: Sequence[Run]) -> str:
