@@ -208,7 +208,7 @@ def test_a_picture_names_its_groups(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert plot_main([str(tmp_path / "s" / "0"), str(tmp_path / "s" / "2"), f"out={tmp_path}/a.png"]) == 0
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     drawn = (tmp_path / "a.svg").read_text()
-    assert "ppo.lr=0.001 (2 seeds)" in drawn and "ppo.lr=0.0001 -->" in drawn and "seconds" in drawn
+    assert "ppo.lr=0.001 (2 runs)" in drawn and "ppo.lr=0.0001 -->" in drawn and "seconds" in drawn
     assert "ppo.lr=0.001: 2 runs" in capsys.readouterr().out
 
 

@@ -58,10 +58,12 @@ def draw_curves(groups: Sequence[Group], metrics: Sequence[str], axis: XAxis, pa
     for panel, metric in zip(panels, metrics):
         for number, group in enumerate(groups):
             curve = mean_curve(group.runs, metric, axis)
-            label = f"{group.label} ({len(group.runs)} seeds)" if len(group.runs) > 1 else group.label
+            label = f"{group.label} ({len(group.runs)} runs)" if len(group.runs) > 1 else group.label
             colour = f"C{number % 10}"
             # names of behaviors may hold $, which matplotlib takes for formulas
-            panel.plot(curve.x, curve.mean, color=colour, label=label.replace("$", r"\$"), linewidth=1.5)
+            marker = "." if len(curve.x) == 1 else ""
+            line = {"color": colour, "marker": marker, "linewidth": 1.5}
+            panel.plot(curve.x, curve.mean, label=label.replace("$", r"\$"), **line)
             low, high = curve.mean - curve.spread, curve.mean + curve.spread
             panel.fill_between(curve.x, low, high, color=colour, alpha=0.2, linewidth=0)
         panel.set_ylabel(metric.replace("$", r"\$"))

@@ -138,7 +138,7 @@ class Chart {
     this.svg.addEventListener("pointermove", (event) => this.move(event));
     this.svg.addEventListener("pointerdown", (event) => this.press(event));
     this.svg.addEventListener("pointerup", (event) => this.release(event));
-    this.svg.addEventListener("pointerleave", () => this.leave());
+    this.svg.addEventListener("pointerleave", (event) => event.pointerType === "mouse" && this.leave());
     this.svg.addEventListener("dblclick", () => zoom(null));
   }
 
@@ -162,6 +162,7 @@ class Chart {
     const inside = draw(this.svg, "g", {"clip-path": `url(#${clip})`});
     for (const one of this.series) this.drawSeries(inside, one);
     this.over = draw(this.svg, "g", {});
+    if (!this.tip.hidden) this.showTip(this.pixel);
   }
 
   scale() {
@@ -175,7 +176,10 @@ class Chart {
         if (one.high[row] !== null) values.push(one.high[row]);
       });
     this.isEmpty = values.length === 0;
-    if (this.isEmpty) return;
+    if (this.isEmpty) {
+      this.tip.hidden = true;
+      return;
+    }
     let [low, high] = extent([values]);
     if (view.log) [low, high] = low === high ? [low / 2, high * 2] : [low / 1.05, high * 1.05];
     else {
@@ -241,11 +245,12 @@ class Chart {
       const [low, high] = [Math.min(pixel, this.drag), Math.max(pixel, this.drag)];
       draw(this.over, "rect", {class: "box", x: low, y: TOP, width: high - low, height: HEIGHT - TOP - BOTTOM});
     }
-    view.at = this.value(pixel);
     this.showTip(pixel);
   }
 
   showTip(pixel) {
+    this.pixel = pixel;
+    view.at = this.value(pixel);
     draw(this.over, "line", {class: "cursor", x1: pixel, x2: pixel, y1: TOP, y2: HEIGHT - BOTTOM});
     const rows = [];
     let at = view.at;
@@ -272,7 +277,9 @@ class Chart {
   }
 
   press(event) {
-    // a finger that moves along reads values, or scrolls; it zooms by the buttons
+    // a finger reads values, which stay when it is lifted, or scrolls; it zooms by the buttons
+    for (const other of charts) if (other !== this) other.leave();
+    if (event.pointerType !== "mouse") this.move(event);
     if (event.pointerType !== "mouse" || event.button !== 0 || this.isEmpty) return;
     this.drag = event.clientX - this.svg.getBoundingClientRect().left;
     this.svg.setPointerCapture(event.pointerId);
