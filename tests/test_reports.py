@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import urllib.error
 import urllib.request
 from html.parser import HTMLParser
@@ -21,6 +22,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mappo_unity.cli import plot_main, report_main
+from mappo_unity.config.compose import check_effect, compose_config
 from mappo_unity.config.schema import Config, LogConfig, XAxis
 from mappo_unity.errors import ConfigError
 from mappo_unity.reports import data, videos
@@ -192,6 +194,18 @@ def test_a_curve_over_time_leaves_rows_without_numbers_out(tmp_path: Path) -> No
     x, y = curve_of(run, "return_mean", XAxis.time)
     assert x.tolist() == [1.0, 3.0] and y.tolist() == [1.0, 3.0]
     assert len(mean_curve([run], "nothing", XAxis.time).x) == 0
+
+
+def test_runs_are_shown_without_torch(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", rows=ROWS)
+    code = f"""import sys
+from mappo_unity.cli import plot_main, report_main
+plot_main(["--help"]), report_main(["--help"])
+code = report_main([{str(tmp_path / "run")!r}])
+sys.exit(code or bool({{'torch', 'matplotlib', 'mujoco', 'mlagents_envs'}} & set(sys.modules)))"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "x: decisions|time = decisions" in done.stdout and "report.html: 1 run, " in done.stdout
 
 
 # The picture
@@ -490,6 +504,15 @@ def test_a_port_that_is_taken_is_refused(tmp_path: Path) -> None:
         LogConfig(dashboard_port=0)
     with dashboard(LogConfig(), tmp_path) as nothing:
         assert nothing is None
+
+
+def test_a_port_without_a_dashboard_is_refused() -> None:
+    lines = ["env=Basic", "log.dashboard_port=8000"]
+    with pytest.raises(
+        ConfigError, match=r"log\.dashboard_port=8000 has no effect without log\.dashboard=true"
+    ):
+        check_effect(lines, [compose_config(lines).config])
+    check_effect(lines, [compose_config([*lines, "log.dashboard=true"]).config])
 
 
 def test_a_training_run_is_followed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

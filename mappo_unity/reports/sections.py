@@ -14,9 +14,8 @@ from mappo_unity.reports.document import table
 from mappo_unity.reports.groups import run_names, set_apart, varied
 from mappo_unity.reports.reading import CONFIG, METRICS, Run, default_options
 
-_COPIED_S = (
-    60  # between the date of a start and the file's own: a larger gap means that the folder was copied
-)
+_COPIED_S = 60
+"""Between a start and the date of its config.yaml: where more seconds lie, the folder was copied."""
 
 
 def outcome(runs: Sequence[Run]) -> str:
@@ -47,7 +46,7 @@ def outcome(runs: Sequence[Run]) -> str:
 
 
 def timing(runs: Sequence[Run]) -> str:
-    """Return where the time went: a bar and figures for each run."""
+    """Return where the time went: seconds and shares, a row a run."""
     rows = []
     for run, name in zip(runs, run_names(runs)):
         collect, update, rest = (seconds(run)[part] for part in ("collect", "update", "rest"))
@@ -66,7 +65,7 @@ def timing(runs: Sequence[Run]) -> str:
 
 
 def options(runs: Sequence[Run]) -> str:
-    """Return the options that differ from the defaults, and between runs; a column a run where they do."""
+    """Return the options that differ from the defaults or between runs, with all values that they have."""
     defaults, keys = default_options(), set(varied([run.options for run in runs]))
     shown = [
         key
