@@ -12,7 +12,7 @@ import pytest
 
 from mappo_unity.cli import league_main
 from mappo_unity.config.compose import compose_config, compose_plain
-from mappo_unity.config.plain_options import take_policies
+from mappo_unity.config.plain_options import take_words
 from mappo_unity.config.schema import Backend, EnvConfig, LeagueConfig
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.league.checks import League, Player, check_league
@@ -135,7 +135,7 @@ def test_names_are_short_and_tell_the_players_apart() -> None:
 def test_words_before_the_options_are_the_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("ppo.lr=1e-4,seed=0").mkdir()
-    lines = take_policies(["a, b/jürgen", "ppo.lr=1e-4,seed=0", "${x}", "matches=4"])
+    lines = take_words(["a, b/jürgen", "ppo.lr=1e-4,seed=0", "${x}", "matches=4"], LeagueConfig, "policies")
     cfg = compose_plain(lines, LeagueConfig)
     assert cfg.policies == ["a, b/jürgen", "ppo.lr=1e-4,seed=0", "${x}"] and cfg.matches == 4
 

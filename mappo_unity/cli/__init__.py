@@ -50,6 +50,16 @@ def league_main(arguments: list[str] | None = None) -> int:
     return _run("league", arguments)
 
 
+def plot_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-plot: draw curves of runs as a picture; return the exit code."""
+    return _run("plot", arguments)
+
+
+def report_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-report: write a page of HTML about runs; return the exit code."""
+    return _run("report", arguments)
+
+
 def player_main(arguments: list[str] | None = None) -> int:
     """Run mappo-player: serve a scene as a Unity player; return the exit code."""
     return _run("player", arguments)

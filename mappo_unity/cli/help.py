@@ -84,6 +84,33 @@ Examples:
   mappo-league A.onnx B.onnx env=unity env.file_name=builds/Game      in a player, started for each pair
 """
 
+PLOT_USAGE = """\
+Draw curves of runs as a picture: the mean over seeds and its standard deviation. Runs that differ only in
+their seed are one line; the legend names the options in which lines differ. Needs the extra [plot].
+
+Usage:
+  mappo-plot RUN ... [option=value ...]     run folders, sweep folders, folders of runs
+  mappo-plot --help | --version
+
+Examples:
+  mappo-plot outputs/multirun/3DBall/2026-11-20_12-00-00
+  mappo-plot outputs/learn x=time metric=return_mean,entropy out=learn.svg
+"""
+
+REPORT_USAGE = """\
+Write one page of HTML about runs: outcome, curves to hover and zoom, options, timing, versions, videos.
+It holds everything and loads nothing; any browser shows it.
+
+Usage:
+  mappo-report RUN ... [out=FILE.html]      a run folder, a sweep folder, a folder of runs
+  mappo-report --help | --version
+
+Examples:
+  mappo-report outputs/3DBall/2026-11-20_12-00-00
+  mappo-report outputs/multirun/3DBall/2026-11-20_12-00-00 out=sweep.html
+  mappo-train env=3DBall log.dashboard=true    the same page of a run while it trains
+"""
+
 
 def train_help(schema: type) -> str:
     """Return the help of mappo-train: usage, choices, options."""
@@ -109,6 +136,16 @@ def export_help(schema: type) -> str:
 def league_help(schema: type) -> str:
     """Return the help of mappo-league: usage, options."""
     return f"{LEAGUE_USAGE}\n{option_text(schema)}"
+
+
+def plot_help(schema: type) -> str:
+    """Return the help of mappo-plot: usage, options."""
+    return f"{PLOT_USAGE}\n{option_text(schema)}"
+
+
+def report_help(schema: type) -> str:
+    """Return the help of mappo-report: usage, options."""
+    return f"{REPORT_USAGE}\n{option_text(schema)}"
 
 
 def option_text(schema: type) -> str:

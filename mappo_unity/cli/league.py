@@ -17,11 +17,11 @@ def run(lines: list[str]) -> int:
     """Play the league; print a table and one line of JSON; return the exit code."""
     with interrupts_end("mappo-league"):
         from mappo_unity.config.compose import compose_plain
-        from mappo_unity.config.plain_options import take_parameters, take_policies
+        from mappo_unity.config.plain_options import take_parameters, take_words
         from mappo_unity.policies.league.checks import check_league
 
         env_lines, lines = take_parameters(lines, "env")
-        config = compose_plain(take_policies(lines), LeagueConfig)
+        config = compose_plain(take_words(lines, LeagueConfig, "policies"), LeagueConfig)
         league = check_league(config, env_lines)
 
         # torch comes only now: mistakes in the options are told at once

@@ -26,6 +26,11 @@ def check_effect(given: Iterable[str], configs: list[Config]) -> None:
     _check_backends(given, configs)
     _check_workers(given, configs)
     _check_teachers(given, configs)
+    if "log.dashboard_port" in given and not any(config.log.dashboard for config in configs):
+        raise ConfigError(
+            f"{_shown('log.dashboard_port', configs[0])} has no effect without log.dashboard=true: give it, "
+            "or leave the port out"
+        )
 
 
 def _check_backends(given: list[str], configs: list[Config]) -> None:

@@ -1,7 +1,7 @@
 """Mistakes in the form of option=value, for the commands without presets.
 
-Those are mappo-eval, mappo-play, mappo-export and mappo-league. Switches, words alone and options given
-twice are told with how they are written.
+Those are mappo-eval, mappo-play, mappo-export, mappo-league, mappo-plot and mappo-report. Switches, words
+alone and options given twice are told with how they are written.
 """
 
 from __future__ import annotations
@@ -14,7 +14,15 @@ from pathlib import Path
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table
 from mappo_unity.config.overrides import parse, shell_word
 from mappo_unity.config.presets import group_choices
-from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, LeagueConfig, PlayConfig
+from mappo_unity.config.schema import (
+    Config,
+    EvalConfig,
+    ExportConfig,
+    LeagueConfig,
+    PlayConfig,
+    PlotConfig,
+    ReportConfig,
+)
 from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
 
@@ -24,6 +32,8 @@ _COMMANDS = {
     "mappo-play": PlayConfig,
     "mappo-export": ExportConfig,
     "mappo-league": LeagueConfig,
+    "mappo-plot": PlotConfig,
+    "mappo-report": ReportConfig,
 }
 """The commands that take option=value, and their options."""
 
@@ -77,13 +87,13 @@ def take_parameters(lines: Sequence[str], below: str = "env.params") -> tuple[li
     return own, [line for line in lines if line not in own]
 
 
-def take_policies(lines: Sequence[str]) -> list[str]:
-    """Return the lines of mappo-league with the words before the options as the option `policies`.
+def take_words(lines: Sequence[str], schema: type, option: str) -> list[str]:
+    """Return the lines with the words before the options as one option: policies of mappo-league, runs.
 
     Raises:
         ConfigError: a word stands behind an option.
     """
-    table = option_table(LeagueConfig)
+    table = option_table(schema)
     words: list[str] = []
     rest = list(lines)
     # the name of a folder may have = in it: ppo.lr=1e-4 is what a sweep calls one
@@ -92,8 +102,8 @@ def take_policies(lines: Sequence[str]) -> list[str]:
 
     for line in rest:
         if "=" not in line and line not in table and not any(word.startswith("-") for word in rest):
-            raise ConfigError(f"{line!r} stands behind {rest[0]}: the policies come first, then the options")
-    return [f"policies=[{','.join(map(quoted_path, words))}]", *rest] if words else rest
+            raise ConfigError(f"{line!r} stands behind {rest[0]}: the {option} come first, then the options")
+    return [f"{option}=[{','.join(map(quoted_path, words))}]", *rest] if words else rest
 
 
 def _is_folder(word: str, table: dict[str, Option]) -> bool:

@@ -755,9 +755,15 @@ class LogConfig:
     """Finished episodes over which return_mean and its like are taken."""
     progress: bool = True
     """Show a live progress line on a terminal, and plain lines elsewhere."""
+    dashboard: bool = False
+    """Serve a page that follows the run to browsers on this machine; the address is printed at the start."""
+    dashboard_port: Optional[int] = None
+    """Port of the page; null: one that is free."""
 
     def __post_init__(self) -> None:
         _at_least("log.return_window", self.return_window, 1)
+        if self.dashboard_port is not None:
+            _within("log.dashboard_port", self.dashboard_port, 1, 65535)
 
 
 @dataclass
@@ -1009,6 +1015,52 @@ class PlayConfig:
 
         if self.run is not None and self.policy is not None:
             raise ConfigError(f"run={self.run} and policy={self.policy} both say who plays: give one of them")
+
+
+class XAxis(Enum):
+    """What curves are drawn over."""
+
+    decisions = "decisions"
+    time = "time"
+
+
+@dataclass
+class PlotConfig:
+    """Options of a picture of curves."""
+
+    runs: list[str] = field(default_factory=list)
+    """What is drawn: run folders, sweep folders, folders of runs; words before options."""
+    metric: str = "return_mean"
+    """Column of metrics.csv; several with commas between them are drawn below one another."""
+    x: XAxis = XAxis.decisions
+    """The axis: agent decisions, or seconds of collecting and learning."""
+    out: str = "curves.png"
+    """Picture to write, NAME.png or NAME.svg."""
+
+    def __post_init__(self) -> None:
+        _check_shown(self.runs, "mappo-plot")
+        _not_empty(metric=self.metric, out=self.out)
+
+
+@dataclass
+class ReportConfig:
+    """Options of a page about runs."""
+
+    runs: list[str] = field(default_factory=list)
+    """What the page is about: run folders, sweep folders, folders of runs; words before options."""
+    out: Optional[str] = None
+    """Page to write; null: report.html in the folder."""
+
+    def __post_init__(self) -> None:
+        _check_shown(self.runs, "mappo-report")
+        _not_empty(out=self.out)
+
+
+def _check_shown(runs: list[str], command: str) -> None:
+    if not runs:
+        raise ConfigError(f"no run is named: name run folders before the options, {command} RUN")
+    if "" in runs:
+        raise ConfigError("a run is empty: give run folders, or folders of runs")
 
 
 def _not_empty(**options: Optional[str]) -> None:

@@ -18,6 +18,7 @@ from mappo_unity.envs.statistics import with_statistics
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
 from mappo_unity.policies.warm_start.start import warm_start
+from mappo_unity.reports.dashboard import dashboard
 from mappo_unity.runs.logger import RunLog
 from mappo_unity.signals import Interrupted
 from mappo_unity.training.collection.fleet import Batches
@@ -59,7 +60,7 @@ def train(
         EnvironmentFailure: the environment failed for good.
         Interrupted: a signal came before the first iteration was complete.
     """
-    with _memory_explained(cfg), set_up(cfg, folder) as setup:
+    with _memory_explained(cfg), dashboard(cfg.log, folder) as address, set_up(cfg, folder) as setup:
         state = RunState(cfg, folder, setup)
         if resume_from is not None:
             state.load(resume_from)
@@ -69,6 +70,8 @@ def train(
         with RunLog(cfg.log, folder, cfg.max_steps, resume_steps, console) as log:
             # not before: until here something may be refused
             log.message(f"run folder: {folder}" if resume_from is None else f"resuming from {resume_from}")
+            if address is not None:
+                log.message(f"dashboard: {address}")
             for note in setup.notes + state.notes + started:
                 log.message(note)
             exports = RunExports(folder, log.message) if cfg.export_onnx else None

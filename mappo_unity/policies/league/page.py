@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from html import escape
 
 from mappo_unity.policies.league.checks import League
@@ -11,30 +11,12 @@ from mappo_unity.policies.league.ratings import ANCHOR, expected
 from mappo_unity.policies.league.standings import Standings
 from mappo_unity.policies.league.table import Result
 from mappo_unity.policies.policy_files import RANDOM
-
-_STYLE = """
-:root { color-scheme: light dark; }
-body { margin: 0 auto; max-width: 46rem; padding: 1rem; background: #ffffff; color: #1d2329;
-  font: 16px/1.5 system-ui, sans-serif; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-p { color: #5a646e; }
-svg { width: 100%; min-width: 26rem; height: auto; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.3rem 0.5rem; text-align: right; border-bottom: 1px solid #d5dae0; }
-td.number { white-space: nowrap; }
-th.name, td.name { text-align: left; overflow-wrap: anywhere; min-width: 7rem; }
-@media (prefers-color-scheme: dark) {
-  body { background: #14181c; color: #e6eaee; }
-  p { color: #a3adb7; }
-  th, td { border-color: #333b43; }
-}
-"""
+from mappo_unity.reports.document import document, table
 
 
 def page(league: League, standings: Standings) -> str:
     """Return the page: ladder, table of players, matrix, table of pairs."""
-    title = f"League in {escape(league.env.name)}"
+    title = f"League in {league.env.name}"
     way = "the most likely actions" if league.deterministic else "sampled actions"
     facts = (
         f"{len(standings.rows)} policies, {league.matches} matches of each pair, both sides in turn, {way}, "
@@ -43,11 +25,7 @@ def page(league: League, standings: Standings) -> str:
     anchor = RANDOM if RANDOM in standings.names else "the mean of all"
 
     parts = [
-        "<!DOCTYPE html>",
-        f"<html lang='en'><head><meta charset='utf-8'><title>{title}</title>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<style>{_STYLE}</style></head><body>",
-        f"<h1>{title}</h1><p>{facts}</p>",
+        f"<h1>{escape(title)}</h1><p>{facts}</p>",
         f"<h2>Ratings</h2><div class='wide'>{svg(standings, *ladder(standings))}</div>",
         _players(standings),
         f"<p>Bradley-Terry ratings on the Elo scale with 95 % intervals; {anchor} is {ANCHOR:.0f}. A lead of "
@@ -58,9 +36,8 @@ def page(league: League, standings: Standings) -> str:
         "<p>Expected: the share of the points that the ratings alone would give. Far from what was won, the "
         "two suit each other in a way that one number a player cannot say.</p>",
         f"<h2>Sides</h2>{_sides(standings.results)}",
-        "</body></html>\n",
     ]
-    return "\n".join(parts)
+    return document(title, parts)
 
 
 def _players(standings: Standings) -> str:
@@ -68,7 +45,7 @@ def _players(standings: Standings) -> str:
         [row.name, f"{row.rating:.0f}", f"{row.low:.0f} to {row.high:.0f}", row.won, row.drawn, row.lost]
         for row in standings.rows
     ]
-    return _table(["name", "rating", "95 %", "won", "drawn", "lost"], rows, 1)
+    return table(["name", "rating", "95 %", "won", "drawn", "lost"], rows, 1)
 
 
 def _pairs(standings: Standings) -> str:
@@ -79,7 +56,7 @@ def _pairs(standings: Standings) -> str:
             shares = (standings.share(first, second), expected(one.rating, other.rating))
             numbers = standings.outcomes[first, second].tolist()
             rows.append([one.name, other.name, *numbers, *(f"{100 * share:.0f} %" for share in shares)])
-    return _table(["policy", "opponent", "won", "drawn", "lost", "points", "expected"], rows, 2)
+    return table(["policy", "opponent", "won", "drawn", "lost", "points", "expected"], rows, 2)
 
 
 def _sides(results: Iterable[Result]) -> str:
@@ -87,16 +64,4 @@ def _sides(results: Iterable[Result]) -> str:
     for row in results:
         length = row.decisions / max(1, row.won + row.drawn + row.lost)
         rows.append([row.policy, row.opponent, row.side, row.won, row.drawn, row.lost, f"{length:.0f}"])
-    return _table(["policy", "opponent", "as", "won", "drawn", "lost", "decisions"], rows, 3)
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[object]], texts: int) -> str:
-    """Return a table whose first columns, `texts` of them, are texts."""
-    kinds = ["class='name'" if index < texts else "class='number'" for index in range(len(heads))]
-    lines = ["<div class='wide'><table><thead><tr>"]
-    lines += [f"<th {kind}>{escape(head)}</th>" for kind, head in zip(kinds, heads)]
-    lines.append("</tr></thead><tbody>")
-    for row in rows:
-        cells = "".join(f"<td {kind}>{escape(str(cell))}</td>" for kind, cell in zip(kinds, row))
-        lines.append(f"<tr>{cells}</tr>")
-    return "".join([*lines, "</tbody></table></div>"])
+    return table(["policy", "opponent", "as", "won", "drawn", "lost", "decisions"], rows, 3)
