@@ -56,6 +56,7 @@ def run_summary(outcome: Outcome, folder: Path) -> list[str]:
         f"evaluate:    mappo-eval {shell_argument('run', folder)}",
         f"resume:      mappo-train {shell_argument('resume', folder)}",
         f"curves:      tensorboard --logdir {shell_word(folder)}",
+        f"report:      mappo-report {shell_word(folder)}",
     ]
 
 
