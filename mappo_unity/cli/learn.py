@@ -8,13 +8,14 @@ import sys
 from pathlib import Path
 
 from mappo_unity.config.mlagents import flags as learn_flags
-from mappo_unity.config.mlagents.read import Settings
+from mappo_unity.config.mlagents.settings import Settings
 from mappo_unity.config.mlagents.translate import Translation
 from mappo_unity.errors import ConfigError
 from mappo_unity.signals import interrupts_wait
 
 _SEEDS = 10_000  # of those that ML-Agents draws where none is given
-_FIXED = ("env", "seed", "env.num_areas")
+_MOST_ROLLED_BACK = 4
+_FIXED = ("env", "recipe", "seed", "env.num_areas")
 """Options of a run that a resumed one keeps."""
 
 
@@ -31,19 +32,61 @@ def run(lines: list[str]) -> int:
     flags = learn_flags.parse_flags(lines)
     settings = read_settings(flags)
     translation = translate(settings)
-    for text in translation.warnings:
+    for text in [*translation.warnings, *_about_flags(settings, flags)]:
         print(f"mappo-learn: {text}", file=sys.stderr)
 
     if flags.print_options:
-        from mappo_unity.config.overrides import shell_word
-
-        print(*map(shell_word, [*translation.lines, *flags.options]), sep="\n")
-        return 0
+        return _print_options(translation, flags.options)
 
     folder = _folder(settings)
     if settings.run["checkpoint_settings.inference"]:
         return _play(settings, folder, flags.deterministic)
     return _train(settings, translation, flags.options, folder)
+
+
+def _about_flags(settings: Settings, flags: learn_flags.Flags) -> list[str]:
+    """Return lines about flags that have no effect beside others."""
+    run, said = settings.run, []
+    if run["checkpoint_settings.inference"]:
+        ignored = [learn_flags.flag_of(key) for key in flags.given if not key.startswith("checkpoint_")]
+        if flags.config is not None:
+            ignored.insert(0, flags.config)
+        if ignored:
+            said.append(
+                f"{', '.join(ignored)}: without effect, --inference plays what the run was trained in"
+            )
+    elif flags.deterministic:
+        said.append("--deterministic has no effect without --inference: training samples its actions")
+
+    if _resumes(settings) and run["checkpoint_settings.initialize_from"] is not None:
+        where = run.where("checkpoint_settings.initialize_from")
+        said.append(f"{where} has no effect: the run is resumed with its own networks")
+    return said
+
+
+def _resumes(settings: Settings) -> bool:
+    """Return whether a run is resumed: --initialize-from beats a file that says both, or resume alone."""
+    given = settings.run.given
+    starts = given.get("checkpoint_settings.initialize_from")
+    by_file = settings.run.where("checkpoint_settings.resume") != "--resume"
+    if starts is not None and starts.where == "--initialize-from" and by_file:
+        return False
+    return bool(settings.run["checkpoint_settings.resume"])
+
+
+def _print_options(translation: Translation, own: list[str]) -> int:
+    from mappo_unity.config.compose import compose_config
+    from mappo_unity.config.overrides import shell_word
+    from mappo_unity.config.schema import Config
+    from mappo_unity.config.text_lines import literal_lines
+
+    lines = [*translation.lines, *literal_lines(own, Config)]
+    try:
+        compose_config(lines)
+    except ConfigError as error:
+        raise translation.explain(error) from error
+    print(*map(shell_word, lines), sep="\n")
+    return 0
 
 
 def _folder(settings: Settings) -> Path:
@@ -60,7 +103,7 @@ def _train(settings: Settings, translation: Translation, own: list[str], folder:
     from mappo_unity.runs import results
 
     run = settings.run
-    resume, force = run["checkpoint_settings.resume"], run["checkpoint_settings.force"]
+    resume, force = _resumes(settings), run["checkpoint_settings.force"]
     results.check_place(folder, resume, force)
     lines = _run_lines(settings, translation, own, folder, resume)
     try:
@@ -77,7 +120,7 @@ def _run_lines(
     settings: Settings, translation: Translation, own: list[str], folder: Path, resume: bool
 ) -> list[str]:
     """Return all lines of a run: those translated, where it goes, what it begins with, the user's own."""
-    from mappo_unity.config.mlagents.translate import scene_of
+    from mappo_unity.config.mlagents.environment import scene_of
     from mappo_unity.config.schema import Config
     from mappo_unity.config.text_lines import literal_lines, quoted_path
 
@@ -160,7 +203,7 @@ def _launch(settings: Settings, lines: list[str], folder: Path) -> int:
     print("\n".join(f"policy: {folder / policy}.onnx" for policy in policies))
     print(f"curves: tensorboard --logdir {folder.parent}", flush=True)
     if outcome.signal is None:
-        return 0
+        return _MOST_ROLLED_BACK if outcome.status == "diverged" else 0
     name = signal.Signals(outcome.signal).name
     print(f"mappo-learn: ended by {name}; --resume goes on", file=sys.stderr)
     return 128 + outcome.signal

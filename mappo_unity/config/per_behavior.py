@@ -48,8 +48,8 @@ def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:
     missing = [name for name in known if name not in cfg.behaviors]
     if cfg.only_named_behaviors and missing:
         raise ConfigError(
-            f"only_named_behaviors=true, and the environment has {', '.join(missing)}, of which nothing is said: "
-            f"give options of {missing[0]}, or only_named_behaviors=false"
+            f"the environment has {', '.join(missing)}, which `behaviors` does not name, and "
+            "only_named_behaviors=true asks for all: name it there, or give only_named_behaviors=false"
         )
 
 

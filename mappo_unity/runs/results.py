@@ -30,7 +30,11 @@ def check_place(folder: Path, resume: bool, force: bool) -> None:
     is_run = (folder / CONFIG).is_file()
     if resume and not is_run:
         trained = (folder / CONFIGURATION).is_file()
-        other = "mlagents-learn trained there, whose .pt files this trainer cannot go on with; " if trained else ""
+        other = (
+            "mlagents-learn trained there, whose .pt files this trainer cannot go on with; "
+            if trained
+            else ""
+        )
         raise ConfigError(
             f"no run to resume in {folder}: {other}leave --resume out to start a run, or "
             "--initialize-from=RUN to begin with another one's networks"
@@ -76,7 +80,9 @@ def write_configuration(folder: Path, configuration: Mapping[str, Any]) -> None:
     write_atomically(folder / CONFIGURATION, text.encode())
 
 
-def publish(folder: Path, checkpoint: Path | None, policies: Sequence[str], reward: float, steps: int) -> None:
+def publish(
+    folder: Path, checkpoint: Path | None, policies: Sequence[str], reward: float, steps: int
+) -> None:
     """Put the last checkpoint's ONNX files where ML-Agents has them, and write training_status.json.
 
     Args:
@@ -102,7 +108,10 @@ def publish(folder: Path, checkpoint: Path | None, policies: Sequence[str], rewa
         write_atomically(named, source.read_bytes())
         entry = {"steps": steps, "file_path": str(named), "reward": None if reward != reward else reward}
         entry |= {"creation_time": time.time(), "auxillary_file_paths": [str(checkpoint)]}
-        status[policy] = {"checkpoints": [entry], "final_checkpoint": entry | {"file_path": f"{policy}{_SUFFIX}"}}
+        status[policy] = {
+            "checkpoints": [entry],
+            "final_checkpoint": entry | {"file_path": f"{policy}{_SUFFIX}"},
+        }
 
     (folder / LOGS).mkdir(exist_ok=True)
     text = json.dumps(status | {"metadata": {"trainer": "mappo-unity"}}, indent=2)

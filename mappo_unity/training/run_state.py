@@ -50,12 +50,12 @@ class RunState:
         folder: the run's folder.
         setup: what is trained.
 
-    Attributes: `iteration`, how many are complete; `agent_steps`, agent decisions; `policy_steps`, those of each
-    policy; `wall_s`, seconds spent
-    collecting and learning; `saved_at`, agent decisions at the last regular checkpoint; `best_score`, of the
-    best checkpoint, which matches choose without it; `dropped_episodes` and `dropped_steps`, what crashed
-    players cost; `samples`, inputs of each policy that an export is compared on; `self_play`, the opponents,
-    where there are some; `notes`, lines for the user about what a checkpoint could not give back.
+    Attributes: `iteration`, how many are complete; `agent_steps`, agent decisions; `policy_steps`, those of
+    each policy; `wall_s`, seconds spent collecting and learning; `saved_at`, agent decisions at the last
+    regular checkpoint; `best_score`, of the best checkpoint, which matches choose without it;
+    `dropped_episodes` and `dropped_steps`, what crashed players cost; `samples`, inputs of each policy that
+    an export is compared on; `self_play`, the opponents, where there are some; `notes`, lines for the user
+    about what a checkpoint could not give back.
     """
 
     def __init__(self, cfg: Config, folder: Path, setup: TrainingSetup) -> None:

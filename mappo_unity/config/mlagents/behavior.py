@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from mappo_unity.config.mlagents.keys import SIGNALS
-from mappo_unity.config.mlagents.read import Section
+from mappo_unity.config.mlagents.settings import Section
 from mappo_unity.errors import ConfigError
 
 Options = dict[str, tuple[Any, str]]
@@ -49,7 +49,7 @@ def learner_options(name: str, section: Section) -> Options:
     return out
 
 
-def behavior_warnings(name: str, section: Section) -> Iterator[str]:
+def behavior_warnings(section: Section) -> Iterator[str]:
     """Yield a line for each key whose wish is not fulfilled."""
     for key, what in _WITHOUT_EFFECT.items():
         if key in section.given and section[key] != section.table[key].default:
@@ -58,7 +58,9 @@ def behavior_warnings(name: str, section: Section) -> Iterator[str]:
     for signal in SIGNALS:
         prefix = f"reward_signals.{signal}"
         if f"{prefix}.encoding_size" in section.given:
-            ignored = "" if not section.has(f"{prefix}.network_settings") else ", and network_settings beat it"
+            ignored = (
+                "" if not section.has(f"{prefix}.network_settings") else ", and network_settings beat it"
+            )
             where = section.where(f"{prefix}.encoding_size")
             yield f"{where} is an old spelling of network_settings.hidden_units{ignored}"
         for key in sorted(section.given):
@@ -72,8 +74,8 @@ def behavior_warnings(name: str, section: Section) -> Iterator[str]:
         for signal in ("curiosity", "rnd", "gail"):
             if _is_on(section, signal):
                 yield (
-                    f"{section.where(f'reward_signals.{signal}.strength')}: with poca a signal of each agent's "
-                    "own has a value of its team, as in ML-Agents"
+                    f"{section.where(f'reward_signals.{signal}.strength')}: with poca an agent's own signal "
+                    "is valued for its team, as in ML-Agents"
                 )
 
 
@@ -139,7 +141,10 @@ def _signal(name: str, section: Section, signal: str) -> Options:
     out |= {
         f"rewards.{signal}.gamma": _taken(section, f"{root}.gamma"),
         f"rewards.{signal}.lr": _taken(section, f"{root}.learning_rate"),
-        f"rewards.{signal}.hidden": ([units] * layers, section.where(f"{root}.network_settings.hidden_units")),
+        f"rewards.{signal}.hidden": (
+            [units] * layers,
+            section.where(f"{root}.network_settings.hidden_units"),
+        ),
         f"rewards.{signal}.normalize": (False, root),
     }
     if signal == "gail":
@@ -173,8 +178,8 @@ _WITHOUT_EFFECT = {
     "threaded": "collect.workers=1 collect.overlap=true lets a process collect while this one learns",
     "framework": "PyTorch is all there is",
     "hyperparameters.shared_critic": "the critic has layers of its own here",
-    "network_settings.deterministic": "training samples; with --inference, --deterministic takes the likeliest",
-    "behavioral_cloning.samples_per_update": "each update clones a share of the recording of the batch's size",
-    "behavioral_cloning.num_epoch": "cloning takes as many epochs as the policy's update (ML-Agents: always 3)",
+    "network_settings.deterministic": "training samples; --inference --deterministic does not",
+    "behavioral_cloning.samples_per_update": "each update clones as many samples as it learns from",
+    "behavioral_cloning.num_epoch": "cloning has the epochs of the policy (in ML-Agents always 3)",
     "behavioral_cloning.batch_size": "cloning takes the policy's minibatches",
 }

@@ -77,7 +77,8 @@ def parse_flags(arguments: list[str]) -> Flags:
 def _about(flag: str) -> str:
     if flag == "--load":
         return "--load is an old flag without effect, as in ML-Agents: --resume goes on with a run"
-    return f"{flag} is an old flag without effect: {'training' if flag == '--train' else 'PyTorch'} is all there is"
+    default = "training" if flag == "--train" else "PyTorch"
+    return f"{flag} is an old flag without effect: {default} is the default"
 
 
 class _Parser(argparse.ArgumentParser):

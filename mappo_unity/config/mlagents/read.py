@@ -1,73 +1,19 @@
-"""ML-Agents' configuration, checked and merged: the file, default_settings below each behavior, flags on top."""
+"""ML-Agents' configuration, checked and merged: default_settings, behaviors, the flags on top."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+import re
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from mappo_unity.config.mlagents.flags import Flags, flag_of
-from mappo_unity.config.mlagents.keys import (
-    BEHAVIOR,
-    FLAG,
-    NUMBER,
-    OPTIONAL,
-    RENAMED,
-    RUN,
-    TEXT,
-    TOP,
-    WHOLE,
-    Key,
-)
-from mappo_unity.config.mlagents.yaml_lines import Node, read_yaml
-from mappo_unity.config.option_table import did_you_mean, show_value
+from mappo_unity.config.mlagents.keys import BEHAVIOR, OPTIONAL, RENAMED, RUN, TOP, Key
+from mappo_unity.config.mlagents.settings import Given, Section, Settings, checked
+from mappo_unity.config.mlagents.yaml_lines import Node, inside, read_yaml
+from mappo_unity.config.option_table import did_you_mean
 from mappo_unity.errors import ConfigError
 
 _SPREAD = ("beta_schedule", "epsilon_schedule")
-
-
-@dataclass(frozen=True)
-class Given:
-    """A value that somebody gave, and where: ``my.yaml, line 5: behaviors.Ball.max_steps``."""
-
-    value: Any
-    where: str
-
-
-@dataclass
-class Section:
-    """Dotted keys that are given, above the defaults of a table."""
-
-    table: Mapping[str, Key]
-    given: dict[str, Given] = field(default_factory=dict)
-
-    def __getitem__(self, key: str) -> Any:
-        return self.given[key].value if key in self.given else self.table[key].default
-
-    def has(self, prefix: str) -> bool:
-        """Return whether a section, or anything in it, is given and not null."""
-        if prefix in self.given:
-            return self.given[prefix].value is not None
-        return any(key.startswith(f"{prefix}.") for key in self.given)
-
-    def where(self, key: str) -> str:
-        """Return where a key is given, or its name."""
-        return self.given[key].where if key in self.given else key
-
-
-@dataclass
-class Settings:
-    """A whole configuration; `behaviors` are merged with default_settings."""
-
-    behaviors: dict[str, Section]
-    default: Section | None
-    """What behaviors have that the file does not name; None: there may be none."""
-    run: Section
-    parameters: dict[str, Given]
-    """As the file has them, by name."""
-    warnings: list[str]
 
 
 def read_settings(flags: Flags) -> Settings:
@@ -93,34 +39,8 @@ def read_settings(flags: Flags) -> Settings:
     for key, value in flags.given.items():
         run.given[key] = Given(checked(value, RUN[key], flag_of(key)), flag_of(key))
 
-    return Settings(sections, default, run, reader.parameters(tree), flags.warnings + reader.warnings)
-
-
-def checked(value: Any, key: Key, where: str) -> Any:
-    """Return a key's value in its type; raise ConfigError, which begins with `where`."""
-    if value is None and key.optional:
-        return None
-
-    if key.kind == FLAG:
-        fits = isinstance(value, bool)
-    elif key.kind in (WHOLE, NUMBER):
-        number = _number(value)
-        fits = number is not None and (key.kind == NUMBER or number.is_integer())
-        value = number if number is None or key.kind == NUMBER else int(number)
-    elif key.kind == TEXT:
-        fits = isinstance(value, (str, int, float)) and not isinstance(value, bool)
-        value = str(value)
-    else:
-        value = value.split() if isinstance(value, str) else value
-        fits = isinstance(value, list)
-        value = [str(item) for item in value] if fits else value
-
-    if not fits:
-        raise ConfigError(f"{where} must be {key.kind}, and is {_shown(value)}")
-    if key.choices and value not in key.choices:
-        hint = did_you_mean(value, key.choices)
-        raise ConfigError(f"{where}: {value} does not exist{hint}; choices: {', '.join(key.choices)}")
-    return value
+    parameters = reader.parameters(tree)
+    return Settings(sections, default, run, parameters, reader.place_in(tree), flags.warnings)
 
 
 class _Reader:
@@ -128,7 +48,6 @@ class _Reader:
 
     def __init__(self, before: str) -> None:
         self._before = before
-        self.warnings: list[str] = []
 
     def place(self, node: Node, key: str) -> str:
         return f"{self._before}{node.line}: {key}"
@@ -148,11 +67,14 @@ class _Reader:
         if node is None or node.value is None:
             return None
         own = self._flat(node, "default_settings")
-        # expanded before behaviors come on top: their learning_rate_schedule does not spread any more
+        # expanded before behaviors come on top: their learning_rate_schedule does not spread any more, and
+        # their signals come beside the environment's
         rate = own.get("hyperparameters.learning_rate_schedule")
         for name in _SPREAD:
             value = Given("linear", "default_settings") if rate is None else rate
             own.setdefault(f"hyperparameters.{name}", value)
+        if not Section(BEHAVIOR, own).has("reward_signals"):
+            own["reward_signals.extrinsic"] = Given({}, "default_settings")
         return Section(BEHAVIOR, own)
 
     def behaviors(self, tree: Node) -> Iterator[tuple[str, Node]]:
@@ -196,6 +118,17 @@ class _Reader:
             for name, item in node.value.items()
         }
 
+    def place_in(self, tree: Node) -> Callable[[str, str], str]:
+        """Return a function that finds the line of what an error about a parameter names."""
+
+        def place(name: str, rest: str) -> str:
+            node = tree.value["environment_parameters"].value[name]
+            for word in re.findall(r"\w+", re.split(r"[=:]", rest)[0]):
+                node = inside(node, word)
+            return self.place(node, f"environment_parameters.{name}")
+
+        return place
+
     def _flat(self, node: Node, root: str, default: Section | None = None) -> dict[str, Given]:
         if node.value is None:
             return {}
@@ -215,8 +148,8 @@ class _Reader:
         own = [name for name in inside if f"hyperparameters.{name}" not in BEHAVIOR]
         alone = f"; its {', '.join(own)} mean nothing to ppo" if own else ""
         raise ConfigError(
-            f"{self.place(kind, root + '.trainer_type')}: sac is not supported, this trainer learns on-policy: "
-            f"give ppo or poca, with hyperparameters of theirs{alone}"
+            f"{self.place(kind, root + '.trainer_type')}: sac is not supported, this trainer "
+            f"learns on-policy: give ppo or poca, with hyperparameters of theirs{alone}"
         )
 
     def _take(
@@ -271,17 +204,3 @@ def _merged(default: dict[str, Given], own: dict[str, Given]) -> dict[str, Given
         if name in kept and kept[name].value is None and any(key.startswith(f"{name}.") for key in own):
             del kept[name]
     return kept | own
-
-
-def _number(value: Any) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        return None
-    try:
-        number = float(value)  # YAML takes 5e5 for a text
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _shown(value: Any) -> str:
-    return repr(value) if isinstance(value, str) else show_value(value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mappo_unity.config.mlagents.keys import OPTIONAL, RUN, SIGNALS
-from mappo_unity.config.mlagents.read import Section, Settings
+from mappo_unity.config.mlagents.settings import Section, Settings
 
 
 def resolved(settings: Settings) -> dict[str, Any]:

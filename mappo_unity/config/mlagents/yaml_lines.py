@@ -10,6 +10,14 @@ import yaml
 
 from mappo_unity.errors import ConfigError
 
+_SPELLINGS = {
+    "lessons": ("curriculum",),
+    "completion": ("completion_criteria",),
+    "sampler": ("sampler_type",),
+    "min": ("min_value",),
+    "max": ("max_value",),
+}
+
 
 @dataclass(frozen=True)
 class Node:
@@ -54,6 +62,25 @@ def read_yaml(path: Path) -> Node:
     if not isinstance(tree.value, dict):
         raise ConfigError(f"{path}, line {tree.line}: the file must hold sections, such as behaviors:")
     return tree
+
+
+def inside(node: Node, word: str) -> Node:
+    """Return the node of a parameter's key or of a lesson's number, also as ML-Agents spells it.
+
+    The node itself where there is none.
+    """
+    if isinstance(node.value, list):
+        return node.value[int(word)] if word.isdigit() and int(word) < len(node.value) else node
+    if not isinstance(node.value, dict):
+        return node
+
+    parameters = node.value.get("sampler_parameters")
+    for name in (word, *_SPELLINGS.get(word, ())):
+        if name in node.value:
+            return node.value[name]
+        if parameters is not None and isinstance(parameters.value, dict) and name in parameters.value:
+            return parameters.value[name]
+    return node
 
 
 def _node(path: Path, loader: yaml.SafeLoader, node: yaml.Node) -> Node:
