@@ -198,9 +198,10 @@ def _launch(settings: Settings, lines: list[str], folder: Path) -> int:
         return 0
 
     steps = outcome.agent_steps
-    results.publish(folder, outcome.last_checkpoint, policies, outcome.return_mean, steps)
+    written = results.publish(folder, outcome.last_checkpoint, policies, outcome.return_mean, steps)
     print(f"finished: {steps:,} agent steps in {outcome.wall_s:.1f} s, mean return {outcome.return_mean:.4g}")
-    print("\n".join(f"policy: {folder / policy}.onnx" for policy in policies))
+    for path in written:
+        print(f"policy: {path}")
     print(f"curves: tensorboard --logdir {folder.parent}", flush=True)
     if outcome.signal is None:
         return _MOST_ROLLED_BACK if outcome.status == "diverged" else 0

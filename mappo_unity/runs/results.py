@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -82,7 +83,7 @@ def write_configuration(folder: Path, configuration: Mapping[str, Any]) -> None:
 
 def publish(
     folder: Path, checkpoint: Path | None, policies: Sequence[str], reward: float, steps: int
-) -> None:
+) -> list[Path]:
     """Put the last checkpoint's ONNX files where ML-Agents has them, and write training_status.json.
 
     Args:
@@ -91,28 +92,36 @@ def publish(
         policies: names of the behaviors.
         reward: mean return of recent episodes.
         steps: agent decisions of the run.
+
+    Returns:
+        The files ``folder/BEHAVIOR.onnx``.
     """
     if checkpoint is None:
-        return
+        return []
 
-    status: dict[str, Any] = {}
+    written, status = [], {}
     for policy in policies:
         found = [checkpoint.with_name(name) for name in (f"final_{policy}{_SUFFIX}", f"final{_SUFFIX}")]
         source = next((path for path in found if path.is_file()), None)
-        if source is None:
+        if source is None:  # no ONNX file could be written, which has been said
             continue
 
-        write_atomically(folder / f"{policy}{_SUFFIX}", source.read_bytes())
-        named = folder / policy / f"{policy}-{steps}{_SUFFIX}"
+        newest, named = folder / f"{policy}{_SUFFIX}", folder / policy / f"{policy}-{steps}{_SUFFIX}"
         named.parent.mkdir(exist_ok=True)
-        write_atomically(named, source.read_bytes())
-        entry = {"steps": steps, "file_path": str(named), "reward": None if reward != reward else reward}
-        entry |= {"creation_time": time.time(), "auxillary_file_paths": [str(checkpoint)]}
-        status[policy] = {
-            "checkpoints": [entry],
-            "final_checkpoint": entry | {"file_path": f"{policy}{_SUFFIX}"},
+        for path in (newest, named):
+            write_atomically(path, source.read_bytes())
+        written.append(newest)
+
+        entry = {
+            "steps": steps,
+            "file_path": str(named),
+            "reward": None if math.isnan(reward) else reward,
+            "creation_time": time.time(),
+            "auxillary_file_paths": [str(checkpoint)],  # spelt as ML-Agents does
         }
+        status[policy] = {"checkpoints": [entry], "final_checkpoint": entry | {"file_path": str(newest)}}
 
     (folder / LOGS).mkdir(exist_ok=True)
-    text = json.dumps(status | {"metadata": {"trainer": "mappo-unity"}}, indent=2)
+    text = json.dumps({**status, "metadata": {"trainer": "mappo-unity"}}, indent=2)
     write_atomically(folder / LOGS / "training_status.json", f"{text}\n".encode())
+    return written

@@ -110,9 +110,11 @@ class RunState:
         learners, seconds = self.setup.learners, collect_s + update_s
         decisions = {name: batch.count_decisions(name) for name in learners}
         steps = sum(decisions.values())
-        self.samples = {
-            name: sample_inputs(batch.rounds.get(name), learner.actor.in_keys)
-            for name, learner in learners.items()
+        # a side that pauses in self-play keeps those it had
+        self.samples = self.samples | {
+            name: sample_inputs(batch.rounds.get(name), learners[name].actor.in_keys)
+            for name, count in decisions.items()
+            if count or name not in self.samples
         }
 
         self.iteration += 1
