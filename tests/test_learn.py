@@ -490,6 +490,41 @@ def test_an_environment_with_more_behaviors_is_refused_without_default_settings(
     assert "SmallWallJump" in capsys.readouterr().err
 
 
+def test_initialize_from_of_the_command_line_beats_resume_of_the_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("my.yaml").write_text(BALL + "checkpoint_settings: {resume: true, initialize_from: a}\n")
+    said = "initialize_from has no effect: the run is resumed"
+    assert learn_main(["my.yaml", "--env=scene:3DBall", "--seed=1"]) == 2
+    error = capsys.readouterr().err
+    assert said in error and "no run to resume in results/ppo" in error
+
+    assert learn_main(["my.yaml", "--env=scene:3DBall", "--seed=1", "--initialize-from=b"]) == 2
+    error = capsys.readouterr().err
+    assert said not in error and "--initialize-from=b: results/b holds neither a run" in error
+
+
+def test_a_side_that_pauses_has_its_files_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lines = ["behaviors:"]
+    for name in ("Goalie", "Striker"):
+        lines.append(f"  {name}: {{trainer_type: ppo, self_play: {{save_steps: 100, team_change: 100}}}}")
+    Path("my.yaml").write_text("\n".join(lines))
+    small = [
+        "env.num_areas=1",
+        "collect.batch_size=100",
+        "max_steps=400",
+        "model.hidden=[8]",
+        "matches.interval=null",
+    ]
+    assert learn_main(["my.yaml", "--env=scene:StrikersVsGoalie", "--run-id=two", "--seed=1", *small]) == 0
+
+    run = Path("results/two")
+    steps = read_metrics(run / "metrics.csv")
+    taken = [(row["Goalie/agent_steps"], row["Striker/agent_steps"]) for row in steps]
+    assert taken[0] != taken[-1] and min(taken[-1]) > 0 and sum(taken[-1]) == steps[-1]["agent_steps"]
+    assert (run / "Goalie.onnx").is_file() and (run / "Striker.onnx").is_file()
+
+
 # --- tags
 
 

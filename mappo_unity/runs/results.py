@@ -18,6 +18,7 @@ import yaml
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.checkpoint_file import FOLDER
 from mappo_unity.runs.folder import CONFIG
 from mappo_unity.runs.lock import locked
 
@@ -68,7 +69,7 @@ def replaced(folder: Path, force: bool) -> Iterator[None]:
     try:
         yield
     finally:
-        if (folder / "metrics.csv").is_file():
+        if any((folder / FOLDER).glob("*.pt")):
             shutil.rmtree(old, ignore_errors=True)
         else:
             shutil.rmtree(folder, ignore_errors=True)
