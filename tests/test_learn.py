@@ -321,6 +321,14 @@ MISTAKES = {
         of_behavior("    hyperparameters:\n      epsilon: 2\n"),
         "line 5: behaviors.Ball.hyperparameters.epsilon: ppo.clip_epsilon=2.0 is out of range",
     ),
+    "out of range in one of two": (
+        "behaviors:\n  A: {trainer_type: ppo}\n  B:\n    hyperparameters:\n      lambd: 2\n",
+        "line 5: behaviors.B.hyperparameters.lambd: behaviors.B.ppo: ppo.gae_lambda=2.0 is out of range",
+    ),
+    "out of range behind a dot": (
+        "behaviors:\n  A: {trainer_type: ppo}\n  B.c:\n    hyperparameters:\n      lambd: 2\n",
+        "line 5: behaviors.B.c.hyperparameters.lambd: behaviors.B.c.ppo: ppo.gae_lambda=2.0 is out of",
+    ),
     "a sampler's key": (
         of_behavior("environment_parameters:\n  mass:\n    sampler_type: uniform\n    sampler_parameters:\n")
         + "      minvalue: 1\n",
@@ -353,6 +361,7 @@ def test_a_mistake_is_one_line_with_file_line_and_key(tmp_path, monkeypatch, cap
         (["--num-envs=2"], "--num-envs: more than one needs --env=PATH"),
         (["--env=scene:4DBall"], "--env: there is no embedded scene '4DBall'"),
         (["--torch-device=tpu"], "--torch-device: tpu is not supported"),
+        (["--env=scene:3DBall", "ppo.epochs=0"], "mappo-learn: ppo.epochs=0 is out of range"),
         (["--run-id=a/b"], "--run-id=a/b must be the name of a folder"),
         (["--resume", "--run-id=none"], "no run to resume in results/none"),
     ],

@@ -6,12 +6,16 @@ import random
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mappo_unity.config.mlagents import flags as learn_flags
-from mappo_unity.config.mlagents.settings import Settings
-from mappo_unity.config.mlagents.translate import Translation
 from mappo_unity.errors import ConfigError
 from mappo_unity.signals import interrupts_wait
+
+if TYPE_CHECKING:
+    from mappo_unity.config.mlagents.settings import Settings
+    from mappo_unity.config.mlagents.translate import Translation
+    from mappo_unity.config.schema import Config
 
 _SEEDS = 10_000  # of those that ML-Agents draws where none is given
 _MOST_ROLLED_BACK = 4
@@ -28,20 +32,33 @@ def run(lines: list[str]) -> int:
     """Train, resume or play as ML-Agents' flags say; return the exit code."""
     from mappo_unity.config.mlagents.read import read_settings
     from mappo_unity.config.mlagents.translate import translate
+    from mappo_unity.config.overrides import given_options, shell_word
+    from mappo_unity.config.schema import Config
+    from mappo_unity.config.text_lines import literal_lines
 
     flags = learn_flags.parse_flags(lines)
     settings = read_settings(flags)
     translation = translate(settings)
+    own = literal_lines(flags.options, Config)
+    for key in given_options(own):  # its value comes from the command line
+        translation.sources.pop(key, None)
+
+    options = [*translation.lines, *own]
+    try:
+        _composed(options)  # a mistake is the only line that is printed
+    except ConfigError as error:
+        raise translation.explain(error) from error
+
     for text in [*translation.warnings, *_about_flags(settings, flags)]:
         print(f"mappo-learn: {text}", file=sys.stderr)
-
     if flags.print_options:
-        return _print_options(translation, flags.options)
+        print(*map(shell_word, options), sep="\n")
+        return 0
 
     folder = _folder(settings)
     if settings.run["checkpoint_settings.inference"]:
         return _play(settings, folder, flags.deterministic)
-    return _train(settings, translation, flags.options, folder)
+    return _train(settings, translation, options, folder)
 
 
 def _about_flags(settings: Settings, flags: learn_flags.Flags) -> list[str]:
@@ -74,19 +91,15 @@ def _resumes(settings: Settings) -> bool:
     return bool(settings.run["checkpoint_settings.resume"])
 
 
-def _print_options(translation: Translation, own: list[str]) -> int:
+def _composed(lines: list[str]) -> Config:
+    """Return the options of a run, those of each behavior checked, too."""
     from mappo_unity.config.compose import compose_config
-    from mappo_unity.config.overrides import shell_word
-    from mappo_unity.config.schema import Config
-    from mappo_unity.config.text_lines import literal_lines
+    from mappo_unity.config.per_behavior import behavior_config
 
-    lines = [*translation.lines, *literal_lines(own, Config)]
-    try:
-        compose_config(lines)
-    except ConfigError as error:
-        raise translation.explain(error) from error
-    print(*map(shell_word, lines), sep="\n")
-    return 0
+    config = compose_config(lines).config
+    for name in config.behaviors:
+        behavior_config(config, name)
+    return config
 
 
 def _folder(settings: Settings) -> Path:
@@ -99,13 +112,13 @@ def _run_folder(settings: Settings, name: str) -> Path:
     return Path(settings.run["checkpoint_settings.results_dir"]) / name
 
 
-def _train(settings: Settings, translation: Translation, own: list[str], folder: Path) -> int:
+def _train(settings: Settings, translation: Translation, options: list[str], folder: Path) -> int:
     from mappo_unity.runs import results
 
     run = settings.run
     resume, force = _resumes(settings), run["checkpoint_settings.force"]
     results.check_place(folder, resume, force)
-    lines = _run_lines(settings, translation, own, folder, resume)
+    lines = _run_lines(settings, options, folder, resume)
     try:
         with interrupts_wait():
             if not resume:
@@ -116,30 +129,25 @@ def _train(settings: Settings, translation: Translation, own: list[str], folder:
         raise translation.explain(error) from error
 
 
-def _run_lines(
-    settings: Settings, translation: Translation, own: list[str], folder: Path, resume: bool
-) -> list[str]:
-    """Return all lines of a run: those translated, where it goes, what it begins with, the user's own."""
+def _run_lines(settings: Settings, options: list[str], folder: Path, resume: bool) -> list[str]:
+    """Return all lines of a run: below the options where it goes and what it begins with."""
     from mappo_unity.config.mlagents.environment import scene_of
-    from mappo_unity.config.schema import Config
-    from mappo_unity.config.text_lines import literal_lines, quoted_path
+    from mappo_unity.config.overrides import last_value
+    from mappo_unity.config.text_lines import quoted_path
+    from mappo_unity.runs.results import LOGS
 
-    lines = list(translation.lines)
-    own = literal_lines(own, Config)
     if resume:
-        kept = [line for line in lines if line.partition("=")[0] not in _FIXED]
-        return [*kept, *own, f"resume={quoted_path(folder)}"]
+        kept = [line for line in options if line.partition("=")[0] not in _FIXED]
+        return [*kept, f"resume={quoted_path(folder)}"]
 
-    if settings.run["env_settings.seed"] < 0:
+    lines = [f"hydra.run.dir={quoted_path(folder)}", *_beginning(settings)]
+    if settings.run["env_settings.seed"] < 0 and last_value(options, "seed") is None:
         seed = random.SystemRandom().randrange(_SEEDS)
         print(f"mappo-learn: no seed is given: seed={seed} is drawn", file=sys.stderr)
         lines.append(f"seed={seed}")
     if scene_of(settings) is None and settings.run["env_settings.env_path"] is not None:
-        from mappo_unity.runs.results import LOGS
-
         lines.append(f"env.player_logs={quoted_path(folder / LOGS)}")
-    lines += _beginning(settings)
-    return [*lines, *own, f"hydra.run.dir={quoted_path(folder)}"]
+    return [*lines, *options]
 
 
 def _beginning(settings: Settings) -> list[str]:
@@ -166,10 +174,10 @@ def _beginning(settings: Settings) -> list[str]:
 
 def _check(lines: list[str]) -> None:
     """Find mistakes before a run that is to be replaced is touched."""
-    from mappo_unity.config.compose import check_effect, compose_config
+    from mappo_unity.config.compose import check_effect
     from mappo_unity.policies.first_checks import check_environment
 
-    config = compose_config(lines).config
+    config = _composed(lines)
     check_effect(lines, [config])
     check_environment(config)
 

@@ -22,7 +22,7 @@ class Key:
 
 
 SCHEDULES = ("linear", "constant")
-TRAINERS = ("ppo", "poca", "sac")
+TRAINERS = ("ppo", "poca")
 ENCODERS = ("simple", "nature_cnn", "resnet", "match3", "fully_connected")
 SIGNALS = ("extrinsic", "curiosity", "rnd", "gail")
 

@@ -86,7 +86,7 @@ class _Reader:
         yield from node.value.items()
 
     def behavior(self, name: str, node: Node, default: Section | None) -> Section:
-        own = self._flat(node, f"behaviors.{name}", default)
+        own = self._flat(node, f"behaviors.{name}")
         section = Section(BEHAVIOR, _merged({} if default is None else default.given, own))
 
         rate = own.get("hyperparameters.learning_rate_schedule")
@@ -129,17 +129,17 @@ class _Reader:
 
         return place
 
-    def _flat(self, node: Node, root: str, default: Section | None = None) -> dict[str, Given]:
+    def _flat(self, node: Node, root: str) -> dict[str, Given]:
         if node.value is None:
             return {}
         if not isinstance(node.value, dict):
             raise ConfigError(f"{self.place(node, root)} must hold keys, such as trainer_type: ppo")
-        self._refuse_sac(node, root, default)
+        self._refuse_sac(node, root)
         out: dict[str, Given] = {}
         self._take(node, root, "", BEHAVIOR, out)
         return out
 
-    def _refuse_sac(self, node: Node, root: str, default: Section | None) -> None:
+    def _refuse_sac(self, node: Node, root: str) -> None:
         kind = node.value.get("trainer_type")
         if kind is None or kind.value != "sac":
             return

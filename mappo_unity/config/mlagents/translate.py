@@ -35,10 +35,14 @@ class Translation:
     def explain(self, error: ConfigError) -> ConfigError:
         """Return an error about an option with the place that it comes from in front."""
         text = str(error)
-        for option, where in self.sources.items():
-            if re.match(rf"(behaviors\.[^:]*: )?{re.escape(option)}(=|:| )", text) and "line " in where:
-                return ConfigError(f"{where}: {text}")
-        return error
+        behavior = re.match(r"(behaviors\..+?\.)\w+: ", text)
+        start, own = (behavior.end(), behavior[1]) if behavior else (0, "")
+        option = re.match(r"[\w.]+", text[start:])
+
+        # what behaviors share stands at the top, under its own name
+        names = [] if option is None else [own + option[0], option[0]]
+        where = next((self.sources[name] for name in names if name in self.sources), "")
+        return ConfigError(f"{where}: {text}") if "line " in where else error
 
 
 def translate(settings: Settings) -> Translation:
@@ -60,13 +64,14 @@ def translate(settings: Settings) -> Translation:
     options |= environment_options(settings.run, warnings)
     options |= _lengths(behaviors, list(sections), warnings)
     options |= _self_play(behaviors, warnings)
-    options |= _learners(sections, settings.default)
+    learners, sources = _learners(sections, settings.default)
+    options |= learners
     options |= _parameters(settings, warnings)
     for section in behaviors:
         warnings += behavior_warnings(section)
 
     lines = [f"{key}={_line_value(key, value)}" for key, (value, _) in options.items()]
-    sources = {key: where for key, (_, where) in options.items()}
+    sources |= {key: where for key, (_, where) in options.items()}
     # what default_settings gives is told once, not for each behavior
     return Translation(lines, list(dict.fromkeys(warnings)), sources)
 
@@ -147,8 +152,8 @@ def _self_play(behaviors: list[Section], warnings: list[str]) -> Options:
 # --- learners
 
 
-def _learners(sections: dict[str, Section], default: Section | None) -> Options:
-    """Return what all behaviors share, and what each has of its own."""
+def _learners(sections: dict[str, Section], default: Section | None) -> tuple[Options, dict[str, str]]:
+    """Return what all behaviors share, and what each has of its own; and where what lies in it comes from."""
     own = {name: learner_options(name, section) for name, section in sections.items()}
     # what the file does not name has the default's, or there is none of it
     common = learner_options("default_settings", default) if default is not None else {}
@@ -158,16 +163,18 @@ def _learners(sections: dict[str, Section], default: Section | None) -> Options:
 
     out: Options = dict(common)
     trees: dict[str, Any] = {}
+    sources: dict[str, str] = {}
     for name, options in own.items():
         differing = {key: v for key, v in options.items() if key not in common or common[key][0] != v[0]}
         if _PLAIN_NAME.fullmatch(name) and differing:
             out |= {f"behaviors.{name}.{key}": value for key, value in differing.items()}
         else:  # a name with dots and the like, or a behavior that is only named
             trees[name] = _tree(differing)
+            sources |= {f"behaviors.{name}.{key}": where for key, (_, where) in differing.items()}
     if trees:
         out["behaviors"] = (trees, "behaviors")
     out["only_named_behaviors"] = (default is None, "behaviors")
-    return out
+    return out, sources
 
 
 def _tree(options: Options) -> dict[str, Any]:
