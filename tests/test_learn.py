@@ -446,14 +446,18 @@ def test_a_run_is_not_overwritten_but_resumed_and_replaced(trained, tmp_path, mo
     # a mistake that shows only when the environment is open leaves the old run
     Path("other.yaml").write_text(BALL.replace("3DBall:", "Other:"))
     assert learn_main(["other.yaml", "--run-id=first", "--force", *SMALL]) == 2
-    assert "no behavior 'Other'" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "other.yaml, line 3: behaviors.Other: the environment has no behavior 'Other'" in error
     assert (run / "config.yaml").read_bytes() == config
 
+    # what a new run would begin with is no matter to one that goes on
+    Path("my.yaml").write_text(BALL + "    init_path: results/first/3DBall.onnx\n")
     assert learn_main(["my.yaml", "--run-id=first", "--resume", *SMALL, "max_steps=720"]) == 0
     assert [row["agent_steps"] for row in read_metrics(run / "metrics.csv")] == [240, 480, 720]
     assert [step for step, _ in points(run / "3DBall")["Policy/Entropy"]] == [240, 480, 720]
     assert (run / "3DBall" / "3DBall-720.onnx").is_file()
 
+    Path("my.yaml").write_text(BALL)
     assert learn_main(["my.yaml", "--run-id=first", "--force", "--seed=6", *SMALL, "max_steps=240"]) == 0
     assert [row["agent_steps"] for row in read_metrics(run / "metrics.csv")] == [240]
     assert os.listdir("results") == ["first"]

@@ -137,7 +137,12 @@ def _run_lines(settings: Settings, options: list[str], folder: Path, resume: boo
     from mappo_unity.runs.results import LOGS
 
     if resume:
-        kept = [line for line in options if line.partition("=")[0] not in _FIXED]
+        names = [line.partition("=")[0] for line in options]
+        kept = [
+            line
+            for name, line in zip(names, options)
+            if name not in _FIXED and name.rpartition(".")[2] != "init_from"
+        ]
         return [*kept, f"resume={quoted_path(folder)}"]
 
     lines = [f"hydra.run.dir={quoted_path(folder)}", *_beginning(settings)]

@@ -87,7 +87,8 @@ class _Reader:
 
     def behavior(self, name: str, node: Node, default: Section | None) -> Section:
         own = self._flat(node, f"behaviors.{name}")
-        section = Section(BEHAVIOR, _merged({} if default is None else default.given, own))
+        given = _merged({} if default is None else default.given, own)
+        section = Section(BEHAVIOR, given, self.place(node, f"behaviors.{name}"))
 
         rate = own.get("hyperparameters.learning_rate_schedule")
         for key in _SPREAD:

@@ -26,6 +26,8 @@ class Section:
 
     table: Mapping[str, Key]
     given: dict[str, Given] = field(default_factory=dict)
+    place: str = ""
+    """Where the section itself stands, where it is one of a file."""
 
     def __getitem__(self, key: str) -> Any:
         return self.given[key].value if key in self.given else self.table[key].default

@@ -42,7 +42,8 @@ class Translation:
         # what behaviors share stands at the top, under its own name
         names = [] if option is None else [own + option[0], option[0]]
         where = next((self.sources[name] for name in names if name in self.sources), "")
-        return ConfigError(f"{where}: {text}") if "line " in where else error
+        rest = text.removeprefix(where.rpartition(": ")[2] + ": ")
+        return ConfigError(f"{where}: {rest}") if "line " in where else error
 
 
 def translate(settings: Settings) -> Translation:
@@ -72,6 +73,7 @@ def translate(settings: Settings) -> Translation:
 
     lines = [f"{key}={_line_value(key, value)}" for key, (value, _) in options.items()]
     sources |= {key: where for key, (_, where) in options.items()}
+    sources |= {f"behaviors.{name}": section.place for name, section in sections.items()}
     # what default_settings gives is told once, not for each behavior
     return Translation(lines, list(dict.fromkeys(warnings)), sources)
 
