@@ -30,6 +30,11 @@ def train_main(arguments: list[str] | None = None) -> int:
     return _run("train", arguments)
 
 
+def learn_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-learn: train with ML-Agents' configuration and flags; return the exit code."""
+    return _run("learn", arguments)
+
+
 def eval_main(arguments: list[str] | None = None) -> int:
     """Run mappo-eval: play episodes with a trained policy; return the exit code."""
     return _run("eval", arguments)

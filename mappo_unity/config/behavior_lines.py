@@ -84,7 +84,7 @@ def _with_one_dictionary(lines: list[str], root: str) -> list[str]:
             trees = [_merged(tree, choice) for tree in trees for choice in choices]
 
     # the dictionary stands where the first of its lines stood
-    return [*others[:first], f"++{root}={','.join(map(_written, trees))}", *others[first:]]
+    return [*others[:first], f"++{root}={','.join(map(written, trees))}", *others[first:]]
 
 
 def dotted_options(line: str) -> dict[str, str]:
@@ -142,16 +142,17 @@ def _merged(tree: Any, other: Any) -> Any:
     return {**tree, **{key: _merged(tree.get(key), value) for key, value in other.items()}}
 
 
-def _written(value: Any) -> str:
+def written(value: Any) -> str:
+    """Return a value in Hydra's grammar."""
     if isinstance(value, QuotedString):
         return str(value.with_quotes())
     if isinstance(value, str):
         return quoted(value)
     if isinstance(value, list):
-        return "[" + ",".join(map(_written, value)) + "]"
+        return "[" + ",".join(map(written, value)) + "]"
     if isinstance(value, dict):
         return (
-            "{" + ",".join(f"{key_spelling(str(key))}:{_written(item)}" for key, item in value.items()) + "}"
+            "{" + ",".join(f"{key_spelling(str(key))}:{written(item)}" for key, item in value.items()) + "}"
         )
 
     return show_value(value)

@@ -45,6 +45,13 @@ def check_behaviors(cfg: Config, policies: Iterable[str]) -> None:
 
         behavior_config(cfg, name)
 
+    missing = [name for name in known if name not in cfg.behaviors]
+    if cfg.only_named_behaviors and missing:
+        raise ConfigError(
+            f"the environment has {', '.join(missing)}, which `behaviors` does not name, and "
+            "only_named_behaviors=true asks for all: name it there, or give only_named_behaviors=false"
+        )
+
 
 def behavior_config(cfg: Config, policy: str) -> BehaviorConfig:
     """Return the options of a policy name.

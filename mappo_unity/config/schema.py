@@ -164,6 +164,13 @@ class ValueLoss(Enum):
     mse = "mse"
 
 
+class TagKind(Enum):
+    """How curves are named on TensorBoard."""
+
+    own = "own"
+    mlagents = "mlagents"
+
+
 class LoggerKind(Enum):
     """Where metrics go besides ``metrics.csv``."""
 
@@ -753,6 +760,11 @@ class LogConfig:
     """Project (wandb) or experiment (mlflow) that the run is filed under."""
     return_window: int = 100
     """Finished episodes over which return_mean and its like are taken."""
+    tags: TagKind = TagKind.own
+    """Names of TensorBoard's curves: those of metrics.csv, by the run's agent decisions (own), or ML-Agents',
+    in a folder for each behavior and by its own decisions (mlagents)."""
+    summary_freq: int = 50_000
+    """With tags=mlagents: decisions of a behavior between two points of its curves."""
     progress: bool = True
     """Show a live progress line on a terminal, and plain lines elsewhere."""
     dashboard: bool = False
@@ -762,6 +774,7 @@ class LogConfig:
 
     def __post_init__(self) -> None:
         _at_least("log.return_window", self.return_window, 1)
+        _at_least("log.summary_freq", self.summary_freq, 1)
         if self.dashboard_port is not None:
             _within("log.dashboard_port", self.dashboard_port, 1, 65535)
 
@@ -791,6 +804,8 @@ class Config:
     behaviors: dict[str, Any] = field(default_factory=dict)
     """Options of one behavior name: behaviors.Goalie.ppo.lr=1e-4 overrides ppo.lr for Goalie; sections
     ppo, model, rewards and bc, init_from, and train=false for one that only plays."""
+    only_named_behaviors: bool = False
+    """Refuse an environment that has behaviors without an entry in `behaviors`, as ML-Agents does."""
     seed: int = 0
     """Seed of the environment, the networks and the sampling."""
     max_steps: int = 1_000_000

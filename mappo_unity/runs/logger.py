@@ -22,8 +22,9 @@ from rich.console import Console
 
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.overrides import shell_argument
-from mappo_unity.config.schema import LogConfig, LoggerKind
+from mappo_unity.config.schema import LogConfig, LoggerKind, TagKind
 from mappo_unity.errors import ConfigError
+from mappo_unity.runs.behavior_events import BehaviorEvents
 from mappo_unity.runs.metrics_csv import STEP, MetricsFile, keep_until, read_metrics
 from mappo_unity.runs.progress import Progress, current_job
 
@@ -90,7 +91,12 @@ class RunLog:
         threading.excepthook = self._on_thread_error
 
         # After `keep_until`: they append to the files that it trims.
-        self._loggers = [_make_logger(backend, cfg, folder) for backend in dict.fromkeys(cfg.loggers)]
+        kinds = list(dict.fromkeys(cfg.loggers))
+        self._events: BehaviorEvents | None = None
+        if cfg.tags is TagKind.mlagents and LoggerKind.tensorboard in kinds:
+            kinds.remove(LoggerKind.tensorboard)
+            self._events = BehaviorEvents(folder, cfg.summary_freq)
+        self._loggers = [_make_logger(backend, cfg, folder) for backend in kinds]
 
     def log(self, row: Mapping[str, Any], histograms: Mapping[str, np.ndarray] | None = None) -> None:
         """Record a row: numbers by name, with ``agent_steps``; NaN (no episode yet) goes to the CSV only.
@@ -115,6 +121,9 @@ class RunLog:
             raise FileNotFoundError(self._folder)
 
         self._metrics.append(row)
+
+        for line in self._events.add(row) if self._events is not None else ():
+            self.message(line)
 
         step = int(row[STEP])
         curves = {name: x for name, x in row.items() if name != STEP and not math.isnan(x)}
@@ -157,6 +166,10 @@ class RunLog:
 
         with suppress(OSError):  # every row has been flushed; what a full disk refused has been said
             self._metrics.close()
+
+        if self._events is not None:
+            with suppress(OSError):
+                self._events.close()
 
         while self._loggers:
             with suppress(OSError):

@@ -84,7 +84,7 @@ def keep_until(folder: Path, agent_steps: int) -> list[str]:
     """
     notes = [_keep_rows(folder / "metrics.csv", agent_steps)]
     for path in sorted((folder / "tensorboard").rglob("*tfevents*")):
-        _keep_events(path, agent_steps)
+        keep_events(path, agent_steps)
     for path in sorted((folder / "csv" / "scalars").rglob("*.csv")):
         notes.append(_keep_scalars(path, agent_steps))
 
@@ -159,7 +159,7 @@ def _set_aside(path: Path, damaged: Sequence[int]) -> str | None:
     return f"{path}: {lines} left out; the file as it was: {copy}"
 
 
-def _keep_events(path: Path, agent_steps: int) -> None:
+def keep_events(path: Path, agent_steps: int) -> None:
     """Trim a TensorBoard event file, record by record; the records that stay keep their bytes."""
     records = _split_records(path.read_bytes())
     _rewrite(path, b"".join(record for step, record in records if step <= agent_steps))

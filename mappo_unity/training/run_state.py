@@ -11,13 +11,14 @@ import torch
 
 from mappo_unity.config.parameters.values import params_at
 from mappo_unity.config.per_behavior import behavior_config
-from mappo_unity.config.schema import Config
+from mappo_unity.config.schema import Config, TagKind
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import sample_inputs
 from mappo_unity.policies.layouts import guessed_otherwise, without_channels
 from mappo_unity.policies.league.growing import step_name
 from mappo_unity.policies.policy import CheckpointPolicy, Policy
 from mappo_unity.runs import checkpoint
+from mappo_unity.runs.behavior_events import policy_step
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.fleet import Batches
@@ -49,17 +50,19 @@ class RunState:
         folder: the run's folder.
         setup: what is trained.
 
-    Attributes: `iteration`, how many are complete; `agent_steps`, agent decisions; `wall_s`, seconds spent
-    collecting and learning; `saved_at`, agent decisions at the last regular checkpoint; `best_score`, of the
-    best checkpoint, which matches choose without it; `dropped_episodes` and `dropped_steps`, what crashed
-    players cost; `samples`, inputs of each policy that an export is compared on; `self_play`, the opponents,
-    where there are some; `notes`, lines for the user about what a checkpoint could not give back.
+    Attributes: `iteration`, how many are complete; `agent_steps`, agent decisions; `policy_steps`, those of
+    each policy; `wall_s`, seconds spent collecting and learning; `saved_at`, agent decisions at the last
+    regular checkpoint; `best_score`, of the best checkpoint, which matches choose without it;
+    `dropped_episodes` and `dropped_steps`, what crashed players cost; `samples`, inputs of each policy that
+    an export is compared on; `self_play`, the opponents, where there are some; `notes`, lines for the user
+    about what a checkpoint could not give back.
     """
 
     def __init__(self, cfg: Config, folder: Path, setup: TrainingSetup) -> None:
         self.cfg, self.setup, self._folder = cfg, setup, folder
         self.iteration = self.agent_steps = self.saved_at = 0
         self.wall_s = 0.0
+        self.policy_steps = dict.fromkeys(setup.learners, 0)
         self.best_score = -math.inf
         self.restarts_before = self.dropped_episodes = self.dropped_steps = 0
         self.recent_episodes = RecentEpisodes(cfg.log.return_window, list(setup.env.behaviors))
@@ -105,20 +108,26 @@ class RunState:
             collect_s, update_s: seconds that collecting and learning took.
         """
         learners, seconds = self.setup.learners, collect_s + update_s
-        steps = sum(batch.count_decisions(name) for name in learners)
-        self.samples = {
-            name: sample_inputs(batch.rounds.get(name), learner.actor.in_keys)
-            for name, learner in learners.items()
+        decisions = {name: batch.count_decisions(name) for name in learners}
+        steps = sum(decisions.values())
+        # a side that pauses in self-play keeps those it had
+        self.samples = self.samples | {
+            name: sample_inputs(batch.rounds.get(name), learners[name].actor.in_keys)
+            for name, count in decisions.items()
+            if count or name not in self.samples
         }
 
         self.iteration += 1
         self.agent_steps += steps
+        self.policy_steps = {name: self.policy_steps[name] + count for name, count in decisions.items()}
         self.wall_s += seconds
         episodes_new = self.recent_episodes.add(batch.episodes)
 
         counters = {"iteration": self.iteration, "agent_steps": self.agent_steps, "wall_s": self.wall_s}
         episodes = {"episodes": self.recent_episodes.total, "episodes_new": episodes_new}
         times = {"steps_per_s": steps / seconds, "collect_s": collect_s, "update_s": update_s}
+        if self.cfg.log.tags is TagKind.mlagents:
+            counters |= {policy_step(name): count for name, count in self.policy_steps.items()}
         return counters | episodes | self.recent_episodes.summary() | times | self.lessons.metrics()
 
     def advance_lessons(self, batch: Batch, batches: Batches) -> list[str]:
@@ -206,6 +215,7 @@ class RunState:
             "matches": self.matches.state_dict(),
             "rng": get_rng_state(),
             "samples": self.samples,
+            "policy_steps": self.policy_steps,
             **{name: getattr(self, name) for name in _COUNTERS},
             # After the counters, whose entry it replaces: a resumed run starts its own count at 0.
             "restarts_before": self.restarts,
@@ -238,8 +248,10 @@ class RunState:
         for name in _COUNTERS:
             setattr(self, name, state[name])
 
-        # checkpoints of older versions hold no samples
+        # checkpoints of older versions hold neither; of one policy all steps are its own
         self.samples = state.get("samples", {})
+        share = self.agent_steps // len(self.policy_steps)
+        self.policy_steps = state.get("policy_steps", dict.fromkeys(self.policy_steps, share))
         self._rng_state = state["rng"]
 
     def restore_rng(self) -> None:

@@ -1,0 +1,236 @@
+"""mappo-learn: train with ML-Agents' configuration and flags."""
+
+from __future__ import annotations
+
+import random
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mappo_unity.config.mlagents import flags as learn_flags
+from mappo_unity.errors import ConfigError
+from mappo_unity.signals import interrupts_wait
+
+if TYPE_CHECKING:
+    from mappo_unity.config.mlagents.settings import Settings
+    from mappo_unity.config.mlagents.translate import Translation
+    from mappo_unity.config.schema import Config
+
+_SEEDS = 10_000  # of those that ML-Agents draws where none is given
+_MOST_ROLLED_BACK = 4
+_FIXED = ("env", "recipe", "seed", "env.num_areas")
+"""Options of a run that a resumed one keeps."""
+
+
+def help_text() -> str:
+    """Return the text of --help."""
+    return learn_flags.help_text()
+
+
+def run(lines: list[str]) -> int:
+    """Train, resume or play as ML-Agents' flags say; return the exit code."""
+    from mappo_unity.config.mlagents.read import read_settings
+    from mappo_unity.config.mlagents.translate import translate
+    from mappo_unity.config.overrides import given_options, shell_word
+    from mappo_unity.config.schema import Config
+    from mappo_unity.config.text_lines import literal_lines
+
+    flags = learn_flags.parse_flags(lines)
+    settings = read_settings(flags)
+    translation = translate(settings)
+    own = literal_lines(flags.options, Config)
+    for key in given_options(own):  # its value comes from the command line
+        translation.sources.pop(key, None)
+
+    options = [*translation.lines, *own]
+    try:
+        _composed(options)  # a mistake is the only line that is printed
+    except ConfigError as error:
+        raise translation.explain(error) from error
+
+    for text in [*translation.warnings, *_about_flags(settings, flags)]:
+        print(f"mappo-learn: {text}", file=sys.stderr)
+    if flags.print_options:
+        print(*map(shell_word, options), sep="\n")
+        return 0
+
+    folder = _folder(settings)
+    if settings.run["checkpoint_settings.inference"]:
+        return _play(settings, folder, flags.deterministic)
+    return _train(settings, translation, options, folder)
+
+
+def _about_flags(settings: Settings, flags: learn_flags.Flags) -> list[str]:
+    """Return lines about flags that have no effect beside others."""
+    run, said = settings.run, []
+    if run["checkpoint_settings.inference"]:
+        ignored = [learn_flags.flag_of(key) for key in flags.given if not key.startswith("checkpoint_")]
+        if flags.config is not None:
+            ignored.insert(0, flags.config)
+        if ignored:
+            said.append(
+                f"{', '.join(ignored)}: without effect, --inference plays what the run was trained in"
+            )
+    elif flags.deterministic:
+        said.append("--deterministic has no effect without --inference: training samples its actions")
+
+    if _resumes(settings) and run["checkpoint_settings.initialize_from"] is not None:
+        where = run.where("checkpoint_settings.initialize_from")
+        said.append(f"{where} has no effect: the run is resumed with its own networks")
+    return said
+
+
+def _resumes(settings: Settings) -> bool:
+    """Return whether a run is resumed: --initialize-from beats a file that says both, or resume alone."""
+    given = settings.run.given
+    starts = given.get("checkpoint_settings.initialize_from")
+    by_file = settings.run.where("checkpoint_settings.resume") != "--resume"
+    if starts is not None and starts.where == "--initialize-from" and by_file:
+        return False
+    return bool(settings.run["checkpoint_settings.resume"])
+
+
+def _composed(lines: list[str]) -> Config:
+    """Return the options of a run, those of each behavior checked, too."""
+    from mappo_unity.config.compose import compose_config
+    from mappo_unity.config.per_behavior import behavior_config
+
+    config = compose_config(lines).config
+    for name in config.behaviors:
+        behavior_config(config, name)
+    return config
+
+
+def _folder(settings: Settings) -> Path:
+    return _run_folder(settings, settings.run["checkpoint_settings.run_id"])
+
+
+def _run_folder(settings: Settings, name: str) -> Path:
+    if name in ("", ".", "..") or Path(name).name != name:
+        raise ConfigError(f"--run-id={name} must be the name of a folder, without others above it")
+    return Path(settings.run["checkpoint_settings.results_dir"]) / name
+
+
+def _train(settings: Settings, translation: Translation, options: list[str], folder: Path) -> int:
+    from mappo_unity.runs import results
+
+    run = settings.run
+    resume, force = _resumes(settings), run["checkpoint_settings.force"]
+    results.check_place(folder, resume, force)
+    lines = _run_lines(settings, options, folder, resume)
+    try:
+        with interrupts_wait():
+            if not resume:
+                _check(lines)
+        with results.replaced(folder, force and not resume):
+            return _launch(settings, lines, folder)
+    except ConfigError as error:
+        raise translation.explain(error) from error
+
+
+def _run_lines(settings: Settings, options: list[str], folder: Path, resume: bool) -> list[str]:
+    """Return all lines of a run: below the options where it goes and what it begins with."""
+    from mappo_unity.config.mlagents.environment import scene_of
+    from mappo_unity.config.overrides import last_value
+    from mappo_unity.config.text_lines import quoted_path
+    from mappo_unity.runs.results import LOGS
+
+    if resume:
+        names = [line.partition("=")[0] for line in options]
+        kept = [
+            line
+            for name, line in zip(names, options)
+            if name not in _FIXED and name.rpartition(".")[2] != "init_from"
+        ]
+        return [*kept, f"resume={quoted_path(folder)}"]
+
+    lines = [f"hydra.run.dir={quoted_path(folder)}", *_beginning(settings)]
+    if settings.run["env_settings.seed"] < 0 and last_value(options, "seed") is None:
+        seed = random.SystemRandom().randrange(_SEEDS)
+        print(f"mappo-learn: no seed is given: seed={seed} is drawn", file=sys.stderr)
+        lines.append(f"seed={seed}")
+    if scene_of(settings) is None and settings.run["env_settings.env_path"] is not None:
+        lines.append(f"env.player_logs={quoted_path(folder / LOGS)}")
+    return [*lines, *options]
+
+
+def _beginning(settings: Settings) -> list[str]:
+    """Return what --initialize-from says: a run of ours, or the ONNX files of one of mlagents-learn."""
+    from mappo_unity.config.text_lines import quoted_path
+    from mappo_unity.runs.folder import CONFIG, runs_below
+
+    name = settings.run["checkpoint_settings.initialize_from"]
+    if name is None:
+        return []
+
+    source = _run_folder(settings, name)
+    if (source / CONFIG).is_file():
+        return [f"init_from={quoted_path(source)}"]
+
+    files = {behavior: source / f"{behavior}.onnx" for behavior in settings.behaviors}
+    if not files or not all(path.is_file() for path in files.values()):
+        raise ConfigError(
+            f"--initialize-from={name}: {source} holds neither a run nor an ONNX file of each behavior"
+            f"{runs_below(source.parent)}"
+        )
+    return [f"behaviors.{behavior}.init_from={quoted_path(path)}" for behavior, path in files.items()]
+
+
+def _check(lines: list[str]) -> None:
+    """Find mistakes before a run that is to be replaced is touched."""
+    from mappo_unity.config.compose import check_effect
+    from mappo_unity.policies.first_checks import check_environment
+
+    config = _composed(lines)
+    check_effect(lines, [config])
+    check_environment(config)
+
+
+def _launch(settings: Settings, lines: list[str], folder: Path) -> int:
+    from mappo_unity.config.mlagents.resolved import resolved
+    from mappo_unity.runs import results
+
+    with interrupts_wait():
+        from mappo_unity.training.launch import launch
+        from mappo_unity.training.run_state import RunState
+
+    policies: list[str] = []
+
+    def look_on(state: RunState) -> None:
+        if not policies:
+            policies.extend(state.setup.learners)
+            results.write_configuration(folder, resolved(settings))
+
+    launched = launch(
+        lines, warn=lambda text: print(f"mappo-learn: {text}", file=sys.stderr), after_iteration=look_on
+    )
+    outcome = launched.outcome
+    if outcome is None:
+        print(launched.message)
+        return 0
+
+    steps = outcome.agent_steps
+    written = results.publish(folder, outcome.last_checkpoint, policies, outcome.return_mean, steps)
+    print(f"finished: {steps:,} agent steps in {outcome.wall_s:.1f} s, mean return {outcome.return_mean:.4g}")
+    for path in written:
+        print(f"policy: {path}")
+    print(f"curves: tensorboard --logdir {folder.parent}", flush=True)
+    if outcome.signal is None:
+        return _MOST_ROLLED_BACK if outcome.status == "diverged" else 0
+    name = signal.Signals(outcome.signal).name
+    print(f"mappo-learn: ended by {name}; --resume goes on", file=sys.stderr)
+    return 128 + outcome.signal
+
+
+def _play(settings: Settings, folder: Path, deterministic: bool) -> int:
+    """Play the run of this name, or that of --initialize-from, without training."""
+    from mappo_unity.cli import eval as evaluation
+    from mappo_unity.config.text_lines import quoted_path
+    from mappo_unity.runs.results import check_place
+
+    name = settings.run["checkpoint_settings.initialize_from"]
+    if name is not None and not settings.run["checkpoint_settings.resume"]:
+        folder = _run_folder(settings, name)
+    check_place(folder, resume=True, force=False)
+    return evaluation.run([f"run={quoted_path(folder)}", f"deterministic={str(deterministic).lower()}"])

@@ -1,0 +1,118 @@
+"""The flags of mlagents-learn, which beat the file."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field
+from typing import Any, NoReturn
+
+from mappo_unity.config.mlagents.keys import FLAG, RUN, WHOLE
+from mappo_unity.errors import ConfigError
+
+_ENV_ARGS = "--env-args"
+_OTHER_NAMES = {"env_settings.env_path": "--env", "torch_settings.device": "--torch-device"}
+_NO_FLAG = ("checkpoint_settings.load_model", "checkpoint_settings.train_model", "env_settings.env_args")
+_DEPRECATED = ("--load", "--train", "--torch", "--tensorflow")
+_HELP = {
+    "env_settings.env_path": "Unity player; scene:NAME an embedded scene; none: the Editor, on port 5004",
+    "checkpoint_settings.run_id": "name of the run's folder below the results (ppo)",
+    "checkpoint_settings.results_dir": "folder of the results (results)",
+    "checkpoint_settings.resume": "go on with the run of this name",
+    "checkpoint_settings.force": "replace the run of this name",
+    "checkpoint_settings.initialize_from": "begin with the networks of another run",
+    "checkpoint_settings.inference": "play without training",
+}
+
+
+@dataclass
+class Flags:
+    """A command line: the file, what flags set (dotted keys), and the rest of it."""
+
+    config: str | None = None
+    given: dict[str, Any] = field(default_factory=dict)
+    options: list[str] = field(default_factory=list)
+    """Options of ours, ppo.epochs=4, which beat everything."""
+    deterministic: bool = False
+    print_options: bool = False
+    warnings: list[str] = field(default_factory=list)
+
+
+def flag_of(key: str) -> str:
+    """Return the flag of a key: ``--num-envs`` for env_settings.num_envs."""
+    return _OTHER_NAMES.get(key, "--" + key.rpartition(".")[2].replace("_", "-"))
+
+
+def help_text() -> str:
+    """Return the text of --help."""
+    return _parser().format_help().rstrip()
+
+
+def parse_flags(arguments: list[str]) -> Flags:
+    """Read a command line; raise ConfigError."""
+    env_args: list[str] | None = None
+    if _ENV_ARGS in arguments:
+        at = arguments.index(_ENV_ARGS)
+        arguments, env_args = arguments[:at], arguments[at + 1 :]
+
+    known = vars(_parser().parse_intermixed_args(arguments))
+    words = known.pop("words")
+    flags = Flags(options=[word for word in words if "=" in word])
+    files = [word for word in words if "=" not in word]
+    if len(files) > 1:
+        raise ConfigError(f"{' and '.join(files)}: one configuration is taken")
+
+    flags.config = files[0] if files else None
+    flags.deterministic = known.pop("deterministic")
+    flags.print_options = known.pop("print_options")
+    for flag in _DEPRECATED:
+        if known.pop(flag.lstrip("-")):
+            flags.warnings.append(_about(flag))
+
+    flags.given = {key: value for key, value in known.items() if value is not None}
+    if env_args is not None:
+        flags.given["env_settings.env_args"] = env_args
+    return flags
+
+
+def _about(flag: str) -> str:
+    if flag == "--load":
+        return "--load is an old flag without effect, as in ML-Agents: --resume goes on with a run"
+    default = "training" if flag == "--train" else "PyTorch"
+    return f"{flag} is an old flag without effect: {default} is the default"
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} (--help lists the flags)")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="mappo-learn",
+        usage="mappo-learn [CONFIG.yaml] [--run-id=NAME] [--env=PATH] [flags] [option=value ...]",
+        description="Train with ML-Agents' configuration and flags (docs/from-mlagents.md).",
+        add_help=False,
+    )
+    parser.add_argument("words", nargs="*", help=argparse.SUPPRESS)
+    parser.add_argument("--help", "-h", action="store_true", help="show this text", default=argparse.SUPPRESS)
+    parser.add_argument("--print-options", action="store_true", help="print mappo-train's options and end")
+    parser.add_argument("--deterministic", action="store_true", help="with --inference: most likely actions")
+
+    for key, about in RUN.items():
+        if key in _NO_FLAG:
+            continue
+        if about.kind == FLAG:
+            parser.add_argument(
+                flag_of(key), dest=key, action="store_true", default=None, help=_HELP.get(key)
+            )
+        else:
+            kind: Any = str
+            if about.kind != "a text":
+                kind = int if about.kind == WHOLE else float
+            parser.add_argument(
+                flag_of(key), dest=key, type=kind, default=None, help=_HELP.get(key), metavar="VALUE"
+            )
+    parser.add_argument(_ENV_ARGS, metavar="...", help="the rest of the line goes to the player")
+    for flag in _DEPRECATED:
+        parser.add_argument(flag, action="store_true", help=argparse.SUPPRESS)
+    return parser

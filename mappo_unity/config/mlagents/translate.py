@@ -1,0 +1,219 @@
+"""From ML-Agents' settings to option lines of mappo-train: one pure function, `translate`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from mappo_unity.config.behavior_lines import written
+from mappo_unity.config.mlagents.behavior import (
+    Options,
+    behavior_warnings,
+    checkpoint_interval,
+    learner_options,
+)
+from mappo_unity.config.mlagents.environment import MANY, environment_options
+from mappo_unity.config.mlagents.settings import Section, Settings
+from mappo_unity.config.parameters.values import PLAYERS, read_parameters
+from mappo_unity.config.text_lines import quoted_path
+from mappo_unity.errors import ConfigError
+
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_-]+")
+_SIMPLE = re.compile(r"(?!null$|true$|false$|inf$|nan$)[A-Za-z_][A-Za-z0-9_]*")
+
+
+@dataclass
+class Translation:
+    """Option lines, what is to be told about them, and where each option's value comes from."""
+
+    lines: list[str]
+    warnings: list[str]
+    sources: dict[str, str] = field(default_factory=dict)
+
+    def explain(self, error: ConfigError) -> ConfigError:
+        """Return an error about an option with the place that it comes from in front."""
+        text = str(error)
+        behavior = re.match(r"(behaviors\..+?\.)\w+: ", text)
+        start, own = (behavior.end(), behavior[1]) if behavior else (0, "")
+        option = re.match(r"[\w.]+", text[start:])
+
+        # what behaviors share stands at the top, under its own name
+        names = [] if option is None else [own + option[0], option[0]]
+        where = next((self.sources[name] for name in names if name in self.sources), "")
+        rest = text.removeprefix(where.rpartition(": ")[2] + ": ")
+        return ConfigError(f"{where}: {rest}") if "line " in where else error
+
+
+def translate(settings: Settings) -> Translation:
+    """Return what a configuration is in options of ours.
+
+    The lines name everything that ML-Agents has a value for, on top of ``recipe=mlagents``. Lengths that
+    ML-Agents counts for each behavior are added up, since ours count the decisions of all.
+
+    Raises:
+        ConfigError: a value that has no meaning here.
+    """
+    sections = settings.behaviors
+    behaviors = list(sections.values())
+    if not behaviors and settings.default is not None:  # read_settings: one of the two is there
+        behaviors = [settings.default]
+
+    options: Options = {}
+    warnings = list(settings.warnings)
+    options |= environment_options(settings.run, warnings)
+    options |= _lengths(behaviors, list(sections), warnings)
+    options |= _self_play(behaviors, warnings)
+    learners, sources = _learners(sections, settings.default)
+    options |= learners
+    options |= _parameters(settings, warnings)
+    for section in behaviors:
+        warnings += behavior_warnings(section)
+
+    lines = [f"{key}={_line_value(key, value)}" for key, (value, _) in options.items()]
+    sources |= {key: where for key, (_, where) in options.items()}
+    sources |= {f"behaviors.{name}": section.place for name, section in sections.items()}
+    # what default_settings gives is told once, not for each behavior
+    return Translation(lines, list(dict.fromkeys(warnings)), sources)
+
+
+def _line_value(key: str, value: Any) -> str:
+    if isinstance(value, str) and (key == "env" or _SIMPLE.fullmatch(value)):
+        return value
+    if key == "env.file_name" or key.rpartition(".")[2] == "init_from":
+        return quoted_path(value)
+    return written(value)
+
+
+# --- what counts for all behaviors
+
+
+def _lengths(behaviors: list[Section], names: list[str], warnings: list[str]) -> Options:
+    def total(key: str) -> tuple[int, str]:
+        return sum(section[key] for section in behaviors), behaviors[0].where(key)
+
+    if len(behaviors) > 1:
+        warnings.append(
+            f"{', '.join(names)} learn in one run: their max_steps, buffer_size, checkpoint_interval and the "
+            "steps of self_play are added up, since ours count the decisions of all"
+        )
+
+    frequencies = {section["summary_freq"] for section in behaviors}
+    if len(frequencies) > 1:
+        warnings.append(f"summary_freq differs: all behaviors have the smallest, {min(frequencies)}")
+
+    kept = [
+        MANY if section["keep_checkpoints"] <= 0 else section["keep_checkpoints"] for section in behaviors
+    ]
+    return {
+        "max_steps": total("max_steps"),
+        "collect.batch_size": total("hyperparameters.buffer_size"),
+        "checkpoint_interval": (
+            sum(checkpoint_interval(section) for section in behaviors),
+            behaviors[0].where("checkpoint_interval"),
+        ),
+        "keep_checkpoints": (max(kept), behaviors[0].where("keep_checkpoints")),
+        "log.tags": ("mlagents", "ML-Agents"),
+        "log.summary_freq": (min(frequencies), behaviors[0].where("summary_freq")),
+    }
+
+
+def _self_play(behaviors: list[Section], warnings: list[str]) -> Options:
+    playing = [section for section in behaviors if section.has("self_play")]
+    if not playing:
+        return {"self_play.save_steps": (None, "self_play")}
+    if len(playing) < len(behaviors):
+        warnings.append("self_play is given for some behaviors only: all with two sides have it here")
+
+    first = playing[0]
+
+    def total(key: str, count: Callable[[Section], int]) -> tuple[int, str]:
+        return sum(count(section) for section in playing), first.where(f"self_play.{key}")
+
+    def change(section: Section) -> int:
+        given = section["self_play.team_change"]
+        return 5 * section["self_play.save_steps"] if given is None else given
+
+    out: Options = {
+        "self_play.save_steps": total("save_steps", lambda section: section["self_play.save_steps"]),
+        "self_play.team_change": total("team_change", change),
+        "self_play.swap_steps": total("swap_steps", lambda section: section["self_play.swap_steps"]),
+        "self_play.num_opponents": (1, "ML-Agents"),
+    }
+    for key in ("window", "play_against_latest_model_ratio", "initial_elo"):
+        values = [section[f"self_play.{key}"] for section in playing]
+        if len(set(values)) > 1:
+            warnings.append(
+                f"{first.where(f'self_play.{key}')} differs between behaviors: {values[0]} is taken"
+            )
+        out[f"self_play.{key}"] = (values[0], first.where(f"self_play.{key}"))
+    return out
+
+
+# --- learners
+
+
+def _learners(sections: dict[str, Section], default: Section | None) -> tuple[Options, dict[str, str]]:
+    """Return what all behaviors share, and what each has of its own; and where what lies in it comes from."""
+    own = {name: learner_options(name, section) for name, section in sections.items()}
+    # what the file does not name has the default's, or there is none of it
+    common = learner_options("default_settings", default) if default is not None else {}
+    if not common:
+        first = next(iter(own.values()))
+        common = {k: v for k, v in first.items() if all(o.get(k, (None,))[0] == v[0] for o in own.values())}
+
+    out: Options = dict(common)
+    trees: dict[str, Any] = {}
+    sources: dict[str, str] = {}
+    for name, options in own.items():
+        differing = {key: v for key, v in options.items() if key not in common or common[key][0] != v[0]}
+        if _PLAIN_NAME.fullmatch(name) and differing:
+            out |= {f"behaviors.{name}.{key}": value for key, value in differing.items()}
+        else:  # a name with dots and the like, or a behavior that is only named
+            trees[name] = _tree(differing)
+            sources |= {f"behaviors.{name}.{key}": where for key, (_, where) in differing.items()}
+    if trees:
+        out["behaviors"] = (trees, "behaviors")
+    out["only_named_behaviors"] = (default is None, "behaviors")
+    return out, sources
+
+
+def _tree(options: Options) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for key, (value, _) in options.items():
+        inside = tree
+        *above, last = key.split(".")
+        for part in above:
+            inside = inside.setdefault(part, {})
+        inside[last] = value
+    return tree
+
+
+# --- environment parameters
+
+
+def _parameters(settings: Settings, warnings: list[str]) -> Options:
+    out: Options = {}
+    for name, given in settings.parameters.items():
+        value = given.value
+        warnings += _about_lessons(given.where, value)
+        try:
+            read_parameters({name: value}, PLAYERS)
+        except ConfigError as error:
+            rest = str(error).removeprefix(f"env.params.{name}")
+            raise ConfigError(f"{settings.places(name, rest)}{rest}") from error
+        out[f"env.params.{name}"] = (value, given.where)
+    return out
+
+
+def _about_lessons(where: str, value: Any) -> Iterator[str]:
+    lessons = value.get("curriculum") if isinstance(value, dict) else None
+    if not isinstance(lessons, list):
+        return
+    for lesson in lessons[:-1]:
+        criteria = lesson.get("completion_criteria") if isinstance(lesson, dict) else None
+        if isinstance(criteria, dict) and "behavior" not in criteria:
+            raise ConfigError(f"{where}: a lesson's completion_criteria have no behavior, which they need")
+    if lessons and isinstance(lessons[-1], dict) and "completion_criteria" in lessons[-1]:
+        yield f"{where}: the completion_criteria of the last lesson have no effect"

@@ -1,0 +1,128 @@
+"""ML-Agents' folder of results: which run may be written, and the files beside ours that its users know.
+
+``results/RUN/`` is a run folder of ours with configuration.yaml, BEHAVIOR.onnx and run_logs/ in it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from mappo_unity.errors import ConfigError
+from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.checkpoint_file import FOLDER
+from mappo_unity.runs.folder import CONFIG
+from mappo_unity.runs.lock import locked
+
+CONFIGURATION = "configuration.yaml"
+LOGS = "run_logs"
+_SUFFIX = ".onnx"
+
+
+def check_place(folder: Path, resume: bool, force: bool) -> None:
+    """Raise ConfigError, with ML-Agents' advice, where a run exists and none is wanted, or the reverse."""
+    is_run = (folder / CONFIG).is_file()
+    if resume and not is_run:
+        trained = (folder / CONFIGURATION).is_file()
+        other = (
+            "mlagents-learn trained there, whose .pt files this trainer cannot go on with; "
+            if trained
+            else ""
+        )
+        raise ConfigError(
+            f"no run to resume in {folder}: {other}leave --resume out to start a run, or "
+            "--initialize-from=RUN to begin with another one's networks"
+        )
+    if folder.is_dir() and any(folder.iterdir()) and not resume and not force:
+        raise ConfigError(
+            f"{folder} holds a previous run: give another --run-id, --resume to go on with it, or --force to "
+            "replace it"
+        )
+    if force and not resume and folder.is_dir() and any(folder.iterdir()):
+        if not is_run and not (folder / CONFIGURATION).is_file():
+            raise ConfigError(f"{folder} holds no run that --force could replace: give another --run-id")
+
+
+@contextmanager
+def replaced(folder: Path, force: bool) -> Iterator[None]:
+    """Set a run that is to be replaced aside; it comes back if the new one trains nothing.
+
+    Raises ConfigError where another process trains in it.
+    """
+    if not force or not folder.is_dir():
+        yield
+        return
+
+    with locked(folder):
+        pass
+    old = folder.with_name(f".{folder.name}.replaced")
+    shutil.rmtree(old, ignore_errors=True)
+    folder.rename(old)
+    try:
+        yield
+    finally:
+        if any((folder / FOLDER).glob("*.pt")):
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+            old.rename(folder)
+
+
+def write_configuration(folder: Path, configuration: Mapping[str, Any]) -> None:
+    """Write configuration.yaml: ML-Agents' settings with all their defaults."""
+    text = yaml.safe_dump(dict(configuration), sort_keys=False, allow_unicode=True)
+    write_atomically(folder / CONFIGURATION, text.encode())
+
+
+def publish(
+    folder: Path, checkpoint: Path | None, policies: Sequence[str], reward: float, steps: int
+) -> list[Path]:
+    """Put the last checkpoint's ONNX files where ML-Agents has them, and write training_status.json.
+
+    Args:
+        folder: of the run.
+        checkpoint: the last one; None: there is none, and nothing is done.
+        policies: names of the behaviors.
+        reward: mean return of recent episodes.
+        steps: agent decisions of the run.
+
+    Returns:
+        The files ``folder/BEHAVIOR.onnx``.
+    """
+    if checkpoint is None:
+        return []
+
+    written, status = [], {}
+    for policy in policies:
+        found = [checkpoint.with_name(name) for name in (f"final_{policy}{_SUFFIX}", f"final{_SUFFIX}")]
+        source = next((path for path in found if path.is_file()), None)
+        if source is None:  # no ONNX file could be written, which has been said
+            continue
+
+        newest, named = folder / f"{policy}{_SUFFIX}", folder / policy / f"{policy}-{steps}{_SUFFIX}"
+        named.parent.mkdir(exist_ok=True)
+        for path in (newest, named):
+            write_atomically(path, source.read_bytes())
+        written.append(newest)
+
+        entry = {
+            "steps": steps,
+            "file_path": str(named),
+            "reward": None if math.isnan(reward) else reward,
+            "creation_time": time.time(),
+            "auxillary_file_paths": [str(checkpoint)],  # spelt as ML-Agents does
+        }
+        status[policy] = {"checkpoints": [entry], "final_checkpoint": entry | {"file_path": str(newest)}}
+
+    (folder / LOGS).mkdir(exist_ok=True)
+    text = json.dumps({**status, "metadata": {"trainer": "mappo-unity"}}, indent=2)
+    write_atomically(folder / LOGS / "training_status.json", f"{text}\n".encode())
+    return written
