@@ -215,6 +215,44 @@ def test_an_episode_worked_by_hand() -> None:
     assert env.agents == [] and env.step({}) == ({}, {}, {}, {}, {})
 
 
+class Switching(Hybrid):
+    """The one agent plays as H at t = 0, and from t = 1 on as J, without an end."""
+
+    @property
+    def behavior_specs(self) -> Any:
+        return {"H": HYBRID, "J": HYBRID}
+
+    def reset(self) -> None:
+        self.t = 0
+        self.result = self.ask([0]), TerminalSteps.empty(HYBRID)
+
+    def step(self) -> None:
+        self.t += 1
+        self.result = self.ask([0]), TerminalSteps.empty(HYBRID)
+
+    def get_steps(self, behavior_name: str) -> Any:
+        if behavior_name == ("J" if self.t else "H"):
+            return self.result
+        return DecisionSteps.empty(HYBRID), TerminalSteps.empty(HYBRID)
+
+
+def test_an_agent_that_changes_its_behavior_is_cut_off_under_its_old_name() -> None:
+    env = parallel_env(Switching())
+    env.reset()
+    assert env.agents == ["H_0"] and env.possible_agents == ["H_0", "J_0"]
+    seen, rewards, _, truncated, _ = env.step({"H_0": GO})
+    assert env.agents == ["J_0"] and truncated == {"H_0": True, "J_0": False}
+    assert rewards == {"H_0": 1, "J_0": 0} and seen["H_0"]["x"] == 0 and seen["J_0"]["x"] == 10
+    _, rewards, *_ = env.step({"J_0": GO})
+    assert rewards == {"J_0": 2}
+
+
+def test_an_option_of_areas_counts() -> None:
+    env = parallel_env("Basic", "env.num_areas=3")
+    assert len(env.possible_agents) == 3
+    env.close()
+
+
 def test_group_rewards_are_added_when_asked_for() -> None:
     env = parallel_env(Hybrid(), add_group_rewards=True)
     env.reset()

@@ -33,7 +33,8 @@ class Session:
 
         if isinstance(env, str):
             cfg = compose_config([f"env={env}", *options]).config.env
-            if num_areas is not None and cfg.backend is not Backend.custom:
+            is_given = any(line.startswith("env.num_areas=") for line in options)
+            if num_areas is not None and not is_given and cfg.backend is not Backend.custom:
                 cfg.num_areas = num_areas
             self.name = cfg.name
             self._make = make_env_function(cfg)
