@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from mlagents_envs.base_env import (
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from mappo_unity import gym_env, make_scene, parallel_env, vector_env
+from mappo_unity.cli import player_main
 from mappo_unity.errors import ConfigError
 
 SCENES = ["3DBall", "Basic", "DungeonEscape", "PushBlock", "SoccerTwos", "WallJump"]
@@ -43,6 +45,13 @@ def test_pettingzoos_own_check(scene: str, capsys: Any) -> None:
         parallel_api_test(env, num_cycles=120)
     env.close()
     assert "Passed" in capsys.readouterr().out
+
+
+def test_a_player_passes_too(tmp_path: Path) -> None:
+    assert player_main(["build", "Basic", str(tmp_path)]) == 0
+    env = parallel_env("unity", f"env.file_name={tmp_path / 'Basic'}", f"env.player_logs={tmp_path}")
+    parallel_api_test(env, num_cycles=30)
+    env.close()
 
 
 @pytest.mark.parametrize("scene", ["Basic", "SoccerTwos"])
