@@ -14,17 +14,22 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mappo_unity.api import load_policy, train
+    from mappo_unity.farama import gym_env, parallel_env, vector_env
     from mappo_unity.scenes import make_scene
 
 __version__ = "0.2.0"
-__all__ = ["load_policy", "make_scene", "train"]
+__all__ = ["gym_env", "load_policy", "make_scene", "parallel_env", "train", "vector_env"]
 
 # Set before torch is imported, unless the environment says otherwise: threads of OpenMP that wait for each
 # other sleep instead of spinning. Where a core is shared, two that spin learn several times slower than one.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 
-_HOMES = {"load_policy": "mappo_unity.api", "train": "mappo_unity.api", "make_scene": "mappo_unity.scenes"}
+_FARAMA = dict.fromkeys(("gym_env", "parallel_env", "vector_env"), "mappo_unity.farama")
+_HOMES = {
+    **{"load_policy": "mappo_unity.api", "train": "mappo_unity.api", "make_scene": "mappo_unity.scenes"},
+    **_FARAMA,
+}
 
 
 def __getattr__(name: str) -> Any:

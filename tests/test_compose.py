@@ -60,7 +60,7 @@ def test_every_file_under_conf_composes(file: str) -> None:
         lines = [f"recipe={group.removeprefix('official/')}", f"env={name}"]
     if name == "unity":
         lines.append("env.file_name=Game")
-    if name == "custom":
+    if name in ("custom", "pettingzoo"):
         lines.append(FACTORY)
     config = compose_config(lines).config
     assert isinstance(config, Config)

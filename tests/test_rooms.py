@@ -10,7 +10,7 @@ import mappo_unity
 
 PACKAGE = Path(mappo_unity.__file__).parent
 ROOMS = (
-    *("errors", "keys", "signals", "config", "scenes", "protocol", "envs"),
+    *("errors", "keys", "signals", "config", "scenes", "protocol", "envs", "farama"),
     *("learning", "runs", "reports", "policies", "viewing", "training", "cli"),
 )
 DOORS = ("__init__", "api", "player")

@@ -21,6 +21,7 @@ class Backend(Enum):
 
     embedded = "embedded"
     custom = "custom"
+    pettingzoo = "pettingzoo"
     player = "player"
     editor = "editor"
     registry = "registry"
@@ -30,7 +31,8 @@ BACKENDS = "backends"
 """Metadata of an option of env: the backends that look at it; without it all do."""
 _STARTED = {BACKENDS: (Backend.player, Backend.registry)}
 _UNITY = {BACKENDS: (Backend.player, Backend.editor, Backend.registry)}
-_ANY_BUT_CUSTOM = {BACKENDS: (Backend.embedded, Backend.player, Backend.editor, Backend.registry)}
+_ANY_BUT_CUSTOM = {BACKENDS: tuple(backend for backend in Backend if backend is not Backend.custom)}
+_FACTORY = {BACKENDS: (Backend.custom, Backend.pettingzoo)}
 
 
 class Activation(Enum):
@@ -187,15 +189,19 @@ class EnvConfig:
     name: str = "3DBall"
     """Name of the environment: a preset in conf/env, also the name of the run's folder."""
     backend: Backend = Backend.embedded
-    """What runs it: an embedded scene, a simulator of your own (custom), a built Unity player, the Unity
-    Editor, or a player that ML-Agents' registry names (registry)."""
+    """What runs it: an embedded scene, a simulator of your own (custom), a PettingZoo parallel environment, a
+    built Unity player, the Unity Editor, or a player that ML-Agents' registry names (registry)."""
     num_areas: Optional[int] = field(default=None, metadata=_ANY_BUT_CUSTOM)
     """Copies of the playing area inside one environment; null: as many as the Unity scene has."""
     params: dict[str, Any] = field(default_factory=dict)
     """Environment parameters (env.params.mass=2) of the scene or player, or arguments of env.factory. Also a
     sampler, {sampler: uniform, min: 0.5, max: 10}, or a curriculum, {lessons: [...]}."""
-    factory: Optional[str] = field(default=None, metadata={BACKENDS: (Backend.custom,)})
-    """With backend=custom: package.module:function, called as function(seed=..., **env.params)."""
+    factory: Optional[str] = field(default=None, metadata=_FACTORY)
+    """With backend=custom or pettingzoo: package.module:function, called as function(seed=..., **env.params);
+    with pettingzoo the seed only if it takes one."""
+    teams: str = field(default="all", metadata={BACKENDS: (Backend.pettingzoo,)})
+    """With backend=pettingzoo, who shares a team: all, none, or package.module:function, called with an
+    agent's name, which returns its team (a whole number or a text; None: alone)."""
     file_name: Optional[str] = field(default=None, metadata={BACKENDS: (Backend.player,)})
     """With backend=player: path of the built Unity player, with or without its extension."""
     registry: str = field(default="default", metadata={BACKENDS: (Backend.registry,)})
@@ -257,13 +263,18 @@ class EnvConfig:
         self._check_players()
         _ = self.parameters  # which looks for mistakes
 
-        if self.backend is Backend.custom and not self.factory:
+        if self.backend in (Backend.custom, Backend.pettingzoo) and not self.factory:
+            kind = "BaseEnv" if self.backend is Backend.custom else "pettingzoo.ParallelEnv"
             raise ConfigError(
-                "env.factory is not given, but env.backend=custom needs it: "
-                "env.factory=package.module:function, a function that returns a BaseEnv"
+                f"env.factory is not given, but env.backend={self.backend.value} needs it: "
+                f"env.factory=package.module:function, a function that returns a {kind}"
             )
         if self.factory is not None and self.factory.count(":") != 1:
             raise ConfigError(f"env.factory={self.factory!r} is not of the form package.module:function")
+        if self.teams not in ("all", "none") and self.teams.count(":") != 1:
+            raise ConfigError(
+                f"env.teams={self.teams!r} must be all, none, or a function, package.module:function"
+            )
 
     def _check_players(self) -> None:
         if self.backend is Backend.player and not self.file_name:
@@ -275,8 +286,9 @@ class EnvConfig:
         if (self.screen_width is None) != (self.screen_height is None):
             raise ConfigError("env.screen_width and env.screen_height belong together: give both or neither")
 
-        if self.backend in (Backend.embedded, Backend.custom, Backend.editor) and self.num_players > 1:
-            larger = " (env.num_areas makes it larger)" if self.backend is Backend.embedded else ""
+        if self.backend not in (Backend.player, Backend.registry) and self.num_players > 1:
+            has_areas = self.backend in (Backend.embedded, Backend.pettingzoo)
+            larger = " (env.num_areas makes it larger)" if has_areas else ""
             raise ConfigError(
                 f"env.num_players={self.num_players} needs env.backend=player or registry; with "
                 f"env.backend={self.backend.value} there is one environment{larger}"
@@ -285,7 +297,7 @@ class EnvConfig:
     @property
     def parameters(self) -> dict[str, Any]:
         """What env.params says, read: see `read_parameters`; raises ConfigError."""
-        takers = {Backend.embedded: SCENE, Backend.custom: FACTORY}
+        takers = {Backend.embedded: SCENE, Backend.custom: FACTORY, Backend.pettingzoo: FACTORY}
         return read_parameters(self.params, takers.get(self.backend, PLAYERS))
 
 
@@ -883,7 +895,7 @@ class Config:
             raise ConfigError(f"{what} does not go with env.backend=editor: there is one Editor")
 
         shared: Optional[int] = None
-        if env.backend is Backend.embedded:
+        if env.backend in (Backend.embedded, Backend.pettingzoo):
             key, shared = "env.num_areas", env.num_areas
             if shared is None:
                 raise ConfigError(f"{what} shares the areas: give env.num_areas, a multiple of {workers}")

@@ -35,7 +35,7 @@ def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv
     Raises:
         ConfigError: the options name nothing that can be opened.
     """
-    if cfg.backend in (Backend.embedded, Backend.custom) and "seed" in cfg.params:
+    if cfg.backend in (Backend.embedded, Backend.custom, Backend.pettingzoo) and "seed" in cfg.params:
         raise ConfigError(
             f"env.params.seed={cfg.params['seed']}: the environment's seed follows from the run's; use seed=N"
         )
@@ -44,6 +44,8 @@ def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv
         return _embedded(cfg)
     if cfg.backend is Backend.custom:
         return _custom(cfg)
+    if cfg.backend is Backend.pettingzoo:
+        return _pettingzoo(cfg)
     return _players(cfg, log_folder)
 
 
@@ -174,3 +176,17 @@ def _custom(cfg: EnvConfig) -> MakeEnv:
     name = f"env.factory={cfg.factory}"
     factory, params = load_factory(str(cfg.factory), name), values_at(cfg.parameters, {})
     return lambda seed: GuardedEnv(call_factory(factory, name, seed, params), name, explain_error)
+
+
+def _pettingzoo(cfg: EnvConfig) -> MakeEnv:
+    from mappo_unity.scenes.pettingzoo.opening import check_package, open_copies
+
+    check_package()
+    name = f"env.factory={cfg.factory}"
+    factory, params = load_factory(str(cfg.factory), name), values_at(cfg.parameters, {})
+
+    def make(seed: int) -> BaseEnv:
+        copies = open_copies(factory, name, seed, params, cfg.num_areas or 1, cfg.teams)
+        return GuardedEnv(copies, name, explain_error)
+
+    return make

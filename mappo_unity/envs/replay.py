@@ -56,7 +56,7 @@ def read_fitting(paths: list[str], spec: BehaviorSpec, name: str) -> Demonstrati
 
 
 def _specs(cfg: Config) -> dict[str, BehaviorSpec] | None:
-    if cfg.env.backend not in (Backend.embedded, Backend.custom):
+    if cfg.env.backend not in (Backend.embedded, Backend.custom, Backend.pettingzoo):
         return None
     env = make_env_function(cfg.env)(cfg.seed)
     try:

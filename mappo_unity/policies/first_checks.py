@@ -29,6 +29,7 @@ from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes import scene_names
 from mappo_unity.scenes.factory import check_factory
 from mappo_unity.scenes.mujoco_check import check_mujoco
+from mappo_unity.scenes.pettingzoo.opening import check_package
 
 _FILE_ENDING = re.compile(rf"\.(?!{SUFFIX[1:]}$)[A-Za-z][A-Za-z0-9]{{0,3}}")
 """An ending of files other than ONNX files; that of a folder such as exports.v1.2 is none."""
@@ -127,6 +128,8 @@ def check_out(out: str) -> None:
 def check_environment(config: Config) -> None:
     """Raise ConfigError if the environment of a run cannot be opened: no such factory, player or port."""
     check_mujoco()  # torchrl loads it, whatever the environment is
+    if config.env.backend is Backend.pettingzoo:
+        check_package()
     check_factory(config.env)
     if config.env.backend is Backend.player:
         find_player(config.env)

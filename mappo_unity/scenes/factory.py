@@ -55,18 +55,22 @@ def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapp
     return env
 
 
-def check_call(factory: Callable[..., Any], name: str, params: Mapping[str, Any]) -> None:
-    """Raise ConfigError if a factory does not take these parameters, as far as its signature says."""
+def check_call(
+    factory: Callable[..., Any], name: str, params: Mapping[str, Any], has_seed: bool = True
+) -> None:
+    """Raise ConfigError if a factory does not take these parameters, and a seed, as its signature says."""
     try:
         signature = inspect.signature(factory)
     except (TypeError, ValueError):
         return  # a builtin without one
 
     try:
-        signature.bind(seed=0, **params)
+        signature.bind(**({"seed": 0} if has_seed else {}), **params)
     except TypeError as error:
+        names = ", ".join(params)
+        given = f"seed and {names or 'nothing else'}" if has_seed else names or "nothing"
         raise ConfigError(
-            f"{name} cannot be called with seed and {', '.join(params) or 'nothing else'}: {error}; it is "
+            f"{name} cannot be called with {given}: {error}; it is "
             f"{getattr(factory, '__name__', 'function')}{signature}"
         ) from error
 

@@ -158,7 +158,7 @@ def worker_config(cfg: Config, number: int, restarts: int = 0) -> Config:
     """
     count, env = cfg.collect.workers, cfg.env
     share: dict[str, Any] = {"max_teams": None if env.max_teams is None else -(-env.max_teams // count)}
-    if env.backend is Backend.embedded:
+    if env.backend in (Backend.embedded, Backend.pettingzoo):
         share["num_areas"] = (env.num_areas or count) // count
     elif env.backend in (Backend.player, Backend.registry):
         share["num_players"] = env.num_players // count
