@@ -2,8 +2,8 @@
 """Train a scene with its preset from several seeds, and evaluate what each run ends with.
 
 Runs lie in OUT/SCENE-seed; one that was cut off is resumed, one that is over is only evaluated. Each result
-is printed and appended to OUT/results.csv: date, scene, seed, decisions, seconds, mean return and its
-standard error over the episodes evaluated.
+is printed and appended to OUT/results.csv: date, scene (of several behaviors the behavior), seed, decisions,
+seconds, mean return and its standard error over the episodes evaluated.
 
     python scripts/learn_scene.py Hallway [--seeds 0 1 2] [--episodes 400] [--out outputs/learn]
 """
@@ -39,9 +39,9 @@ def main() -> None:
         print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores", flush=True)
         folder = arguments.out / f"{arguments.scene}-{seed}"
         train(arguments.scene, seed, folder, arguments.options)
-        row = evaluate(arguments.scene, seed, folder, arguments.episodes)
-        print(row, flush=True)
-        append(arguments.out / "results.csv", row)
+        for row in evaluate(arguments.scene, seed, folder, arguments.episodes):
+            print(row, flush=True)
+            append(arguments.out / "results.csv", row)
 
 
 def train(scene: str, seed: int, folder: Path, options: list[str]) -> None:
@@ -53,23 +53,27 @@ def train(scene: str, seed: int, folder: Path, options: list[str]) -> None:
     subprocess.run([HERE / "mappo-train", *lines], check=True)
 
 
-def evaluate(scene: str, seed: int, folder: Path, episodes: int) -> dict[str, object]:
-    """Evaluate the newest checkpoint, as it explores; return a row of results."""
+def evaluate(scene: str, seed: int, folder: Path, episodes: int) -> list[dict[str, object]]:
+    """Evaluate the newest checkpoint, as it explores; return a row of results for each behavior."""
     newest = sorted((folder / "checkpoints").glob("step_*.pt"))[-1]
     result = mappo_eval(f"run={newest}", f"episodes={episodes}")
+    behaviors = result.get("behaviors") or {scene: result}
 
     with open(folder / "metrics.csv") as file:
         seconds = float(list(csv.DictReader(file))[-1]["wall_s"])
-    return {
-        "date": time.strftime("%Y-%m-%d"),
-        "scene": scene,
-        "seed": seed,
-        "decisions": result["agent_steps"],
-        "seconds": round(seconds),
-        "mean_return": round(result["mean_return"], 3),
-        "stderr": round(result["stderr"], 3),
-        "episodes": result["episodes"],
-    }
+    return [
+        {
+            "date": time.strftime("%Y-%m-%d"),
+            "scene": name.split("?")[0],
+            "seed": seed,
+            "decisions": result["agent_steps"],
+            "seconds": round(seconds),
+            "mean_return": round(figures["mean_return"], 3),
+            "stderr": round(figures["stderr"], 3),
+            "episodes": figures["episodes"],
+        }
+        for name, figures in behaviors.items()
+    ]
 
 
 def mappo_eval(*options: str, timeout_s: float | None = None) -> dict[str, Any]:
