@@ -172,7 +172,7 @@ def commands_page() -> str:
     parts = ["# Every command\n\nWhat `--help` prints."]
 
     for name, module in declared:
-        with mock.patch.dict(os.environ, COLUMNS="90"):  # the help is as wide as the terminal
+        with mock.patch.dict(os.environ, COLUMNS="84"):  # the help is as wide as the terminal
             text = importlib.import_module(f"mappo_unity.cli.{module}").help_text().rstrip()
         if name == "mappo-train":
             text = text.partition("\nOptions (")[0].rstrip()
