@@ -120,6 +120,12 @@ def _answer(command: str, name: str, lines: list[str]) -> int:
         print(f"{name} {__version__}")
         return 0
 
+    if lines[:1] == ["--completion"]:
+        from mappo_unity.cli.completion import completion_script
+
+        print(completion_script(" ".join(lines[1:])), end="")
+        return 0
+
     # a Ctrl-C that breaks an import off would end in a traceback of a half loaded module
     with interrupts_wait():
         module = importlib.import_module(f"{__name__}.{command}")

@@ -19,6 +19,7 @@ Usage:
   mappo-train -m [option=value,value ...]   sweep: one run for each combination
   mappo-train resume=RUN [option=value ...] resume a run folder or a checkpoint
   mappo-train --config FILE [option=value ...]  with the options of a YAML file, such as a run's config.yaml
+  mappo-train --completion bash|zsh|fish    print a script with which the shell completes options and presets
   mappo-train --help | --version
 
 Examples:

@@ -140,6 +140,10 @@ def shell_word(text: str | Path) -> str:
 
 
 def _parse_line(line: str) -> Override:
+    if line.partition("=")[0] in ("-sc", "--shell-completion"):  # Hydra's
+        raise ConfigError(
+            f"{line} is not an option: --completion bash (or zsh, fish) prints a script for the shell"
+        )
     if line.startswith("-"):
         raise ConfigError(
             f"{line} is not an option: settings are written option=value (seed=1); --help lists the few "

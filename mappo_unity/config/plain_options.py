@@ -26,7 +26,7 @@ from mappo_unity.config.schema import (
 from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
 
-_COMMANDS = {
+COMMANDS = {
     "mappo-train": Config,
     "mappo-eval": EvalConfig,
     "mappo-play": PlayConfig,
@@ -112,7 +112,7 @@ def _is_folder(word: str, table: dict[str, Option]) -> bool:
 
 def _check_other_command(key: str, schema: type, table: dict[str, Option]) -> None:
     """Raise ConfigError for an option that another command has."""
-    tables = {name: option_table(other) for name, other in _COMMANDS.items() if other is not schema}
+    tables = {name: option_table(other) for name, other in COMMANDS.items() if other is not schema}
     owners = [name for name, other in tables.items() if find_option(other, key) is not None]
 
     if key in group_choices() or key.startswith(("hydra.", "hydra/")):
@@ -121,7 +121,7 @@ def _check_other_command(key: str, schema: type, table: dict[str, Option]) -> No
     if not owners:
         return
 
-    own = next((name for name, other in _COMMANDS.items() if other is schema), "this command")
+    own = next((name for name, other in COMMANDS.items() if other is schema), "this command")
     hint = ": a run's own options count" if owners == ["mappo-train"] else ""
     raise ConfigError(
         f"{key} is an option of {' and '.join(owners)}, not of {own}{hint}; options here: {', '.join(table)}"
