@@ -14,7 +14,15 @@ from pathlib import Path
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table
 from mappo_unity.config.overrides import parse, shell_word
 from mappo_unity.config.presets import group_choices
-from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, LeagueConfig, PlayConfig
+from mappo_unity.config.schema import (
+    Config,
+    EvalConfig,
+    ExportConfig,
+    LeagueConfig,
+    PlayConfig,
+    PullConfig,
+    PushConfig,
+)
 from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
 
@@ -24,6 +32,8 @@ _COMMANDS = {
     "mappo-play": PlayConfig,
     "mappo-export": ExportConfig,
     "mappo-league": LeagueConfig,
+    "mappo-hub push": PushConfig,
+    "mappo-hub pull": PullConfig,
 }
 """The commands that take option=value, and their options."""
 
