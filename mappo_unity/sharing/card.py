@@ -32,7 +32,7 @@ class Earned:
 
 @dataclass(frozen=True)
 class Won:
-    """Matches against random that were played for the card; shares are of the decided ones."""
+    """Matches against random that were played for the card; shares are of the decided ones (nan: none)."""
 
     share: float
     low: float
@@ -40,6 +40,7 @@ class Won:
     wins: int
     draws: int
     losses: int
+    together: bool = False  # with other policies of the run beside this one
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ class Facts:
     training: Training | None = None
     score: Earned | Won | LastWindow | None = None
     film: str | None = None
+    is_scene: bool = True  # one of ours, which mappo-eval opens by its name
     tags: Sequence[str] = field(default=_TAGS)
 
 
@@ -162,7 +164,7 @@ def _metric(score: Earned | Won | LastWindow | None) -> dict[str, Any] | None:
     if isinstance(score, Earned):
         value = f"{score.mean:.4g} +/- {score.stderr:.2g}"
         return {"type": "mean_reward", "name": "mean_reward", "value": value, "verified": False}
-    if isinstance(score, Won):
+    if isinstance(score, Won) and score.wins + score.losses:
         name = "share won against random"
         return {"type": "win_rate", "name": name, "value": round(score.share, 4), "verified": False}
     return None
@@ -199,9 +201,13 @@ def _score(score: Earned | Won | LastWindow | None) -> str:
             f"{high:.4g}, of {score.episodes:,} episodes of an agent, with sampled actions."
         )
 
+    if isinstance(score, Won) and not score.wins + score.losses:
+        return f"No match against a random side was decided: {score.draws} drawn."
+
     if isinstance(score, Won):
+        who = "With the run's other policies on its side, won" if score.together else "Won"
         return (
-            f"Won {100 * score.share:.1f} % of the decided matches against a random side, 95 % interval "
+            f"{who} {100 * score.share:.1f} % of the decided matches against a random side, 95 % interval "
             f"(Wilson) {100 * score.low:.1f} % to {100 * score.high:.1f} %: {score.wins} won, {score.draws} "
             f"drawn, {score.losses} lost, with sampled actions, half of them on each side."
         )
@@ -232,10 +238,20 @@ def _training(facts: Facts) -> str:
 
 
 def _use(facts: Facts) -> str:
+    unity = (
+        f"In Unity: copy `{facts.file}` into `Assets` and drag it onto *Model* in the Behavior Parameters of "
+        "the agents."
+    )
+    if not facts.is_scene:
+        run = shell_argument("run", facts.file)
+        return (
+            f"{unity}\n\nWith mappo-unity: `mappo-eval {run}`, with the file in the folder of a run of that "
+            "environment."
+        )
+
     env = shell_argument("env", facts.env or "NAME")
     return (
-        f"In Unity: copy `{facts.file}` into `Assets` and drag it onto *Model* in the Behavior Parameters of "
-        f"the agents.\n\nWith mappo-unity:\n\n"
+        f"{unity}\n\nWith mappo-unity (a folder of several files plays their behaviors):\n\n"
         f"    mappo-eval {shell_argument('run', facts.file)} {env}\n"
         f"    mappo-play {shell_argument('policy', facts.file)} {env}"
     )

@@ -24,6 +24,7 @@ from mappo_unity.runs import checkpoint as checkpoints
 from mappo_unity.runs.folder import CONFIG, VERSIONS, find_run
 from mappo_unity.runs.metrics_csv import STEP, read_metrics
 from mappo_unity.runs.options import config_to_play
+from mappo_unity.scenes import scene_names
 from mappo_unity.sharing.card import Earned, Facts, LastWindow, Training, Won
 from mappo_unity.sharing.train_line import train_line
 from mappo_unity.viewing.play import play
@@ -90,6 +91,7 @@ def gather(
                 training=_training(trained, config),
                 score=scores.get(name) or _last_window(trained, name),
                 film=film.name if film is not None else None,
+                is_scene=trained.state["env_name"] in scene_names(),
             )
         )
     return facts
@@ -106,13 +108,15 @@ def facts_of_file(path: Path) -> Facts:
     """Return what an ONNX file says of itself, where no card lies beside it. Raises ConfigError."""
     policy = OnnxPolicy(path, deterministic=False)
     sensors = [(name, shape[1:]) for name, shape in policy.inputs.items() if "obs" in name]
+    env = policy.metadata.get("env_name", "")
     count = policy.outputs["discrete_actions"][-1] if "discrete_actions" in policy.outputs else 0
     choices = policy.inputs.get("action_masks", [0])[-1]
     return Facts(
         policy=policy.metadata.get("behavior_name", path.stem),
         file=path.name,
-        env=policy.metadata.get("env_name", ""),
+        env=env,
         agent_steps=policy.agent_steps,
+        is_scene=not env or env in scene_names(),
         sensors=sensors,
         continuous=policy.outputs.get("continuous_actions", [0])[-1],
         discrete=f"{choices} choices in {count} branch{'es' * (count > 1)}" if count else "",
@@ -148,6 +152,7 @@ def _measured(trained: Trained, episodes: int, behaviors: Iterable[str]) -> dict
             low=result["won_of_decided_low95"],
             high=result["won_of_decided_high95"],
             **{name: result[name] for name in ("wins", "draws", "losses")},
+            together=len(trained.state["layout"]) > 1,
         )
         return {keys.policy_name(name): won for name in names}
 
@@ -169,8 +174,15 @@ def _last_window(trained: Trained, policy: str) -> LastWindow | None:
         return None
 
     rows = [row for row in rows if row[STEP] <= trained.state["agent_steps"]]
-    mean = _last(rows, f"{policy}/return_mean", "return_mean")
+    # Of several behaviors each has a column: "Goalie?team=1/return_mean".
+    columns = rows[-1] if rows else {}
+    own = [name for name in columns if name.endswith("/return_mean") and _policy(name) == policy]
+    mean = _last(rows, *own, "return_mean")
     return None if mean is None else LastWindow(mean, _last(rows, "win_rate_vs_random"))
+
+
+def _policy(column: str) -> str:
+    return keys.policy_name(column.rpartition("/")[0])
 
 
 def _last(rows: Sequence[Mapping[str, float]], *names: str) -> float | None:

@@ -197,8 +197,7 @@ def _refused(repo: str, error: Any) -> Exception:
 
 
 def _unreachable(error: BaseException) -> EnvironmentFailure:
-    endpoint = os.environ.get("HF_ENDPOINT", "https://huggingface.co")
     return EnvironmentFailure(
-        f"the hub at {endpoint} cannot be reached ({type(error).__name__}): see the network, a proxy, and "
-        "HF_ENDPOINT"
+        f"the hub at {import_hub().constants.ENDPOINT} cannot be reached ({type(error).__name__}): see the "
+        "network, a proxy, and HF_ENDPOINT"
     )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mappo_unity.errors import ConfigError
@@ -55,10 +57,10 @@ def _card(model: Path, name: str) -> str:
     """Return the card beside a file, else one of what the file says of itself; with its name on the hub."""
     path = model.with_suffix(CARD)
     if not path.is_file() or path.name == README:
-        return card_text(facts_of_file(model)).replace(model.name, name)
+        return card_text(replace(facts_of_file(model), file=name))
 
     text = path.read_text(encoding="utf-8", errors="replace")
-    return text.replace(model.name, name) if is_ours(text) else text
+    return re.sub(rf"(?<![\w.-]){re.escape(model.name)}", name, text) if is_ours(text) else text
 
 
 def _films(path: Path, models: Sequence[Path]) -> dict[str, Path | bytes]:
