@@ -3,6 +3,7 @@
 import csv
 import math
 import shlex
+import sys
 from dataclasses import replace
 
 import pytest
@@ -113,6 +114,13 @@ def test_a_film_is_linked(run, tmp_path, monkeypatch):
     assert export_main([f"run={run}", f"out={tmp_path}/x.onnx", "video=true"]) == 0
     assert (tmp_path / "x.mp4").stat().st_size > 1000
     assert "[Film](x.mp4)" in (tmp_path / "x.md").read_text()
+
+
+def test_a_film_that_cannot_be_made_is_told_before_anything_is_written(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert export_main([f"run={run}", f"out={tmp_path}/new/x.onnx", "video=true"]) == 2
+    assert "needs the package imageio_ffmpeg" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

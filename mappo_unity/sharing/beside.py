@@ -27,7 +27,11 @@ def check_card(options: ExportConfig, checkpoint: Path) -> None:
         check_evaluation(EvalConfig(run=str(checkpoint), env=trained.env, episodes=options.episodes))
     if options.video:
         check_film(PlayConfig(run=str(checkpoint), env=trained.env))
-        check_video(checkpoint.with_suffix(FILM), caption=True)
+
+        # The folder that the file comes into, or the nearest above it that is there.
+        wanted = Path(options.out or checkpoint).absolute()
+        folder = next(place for place in (wanted, *wanted.parents) if place.is_dir())
+        check_video(folder / f"{checkpoint.stem}{FILM}", caption=True)
 
 
 def write_cards(
