@@ -39,7 +39,10 @@ from mappo_unity.errors import ConfigError
         ("env.params.mass=2", "env.params.mass is an option of mappo-train, not of mappo-eval"),
         ("recipe=mlagents", "recipe is an option of mappo-train, not of mappo-eval"),
         ("hydra.run.dir=x", "hydra.run.dir is an option of mappo-train, not of mappo-eval"),
-        ("video=x.mp4", "video is an option of mappo-play, not of mappo-eval; options here: run, episodes"),
+        (
+            "video=x.mp4",
+            "video is an option of mappo-play and mappo-export, not of mappo-eval; options here: run,",
+        ),
         ("run=${env}", "run=${env}: ${...} is for the options of"),
         ("run:ball", "'run:ball' is not of the form option=value: it is written run=ball"),
         ("help", "'help' is not of the form option=value (did you mean --help?)"),

@@ -4,8 +4,8 @@ One module a command, each with ``run(lines) -> exit code`` and ``help_text()``;
 inside them, so that ``--help`` and mistakes in the options come at once.
 
 Exit codes: 0 done, 1 an error of ours (with its traceback) or a failed job of a sweep, 2 a mistake in the
-options, 3 an environment that failed for good (a checkpoint is written first), 4 a run that ended but most of
-whose updates were rolled back, 130, 138 and 143 ended by SIGINT, SIGUSR1 and SIGTERM.
+options, 3 an environment that failed for good (a checkpoint is written first) or a hub out of reach, 4 a run
+that ended but most of whose updates were rolled back, 130, 138 and 143 ended by SIGINT, SIGUSR1 and SIGTERM.
 """
 
 from __future__ import annotations
@@ -63,6 +63,11 @@ def plot_main(arguments: list[str] | None = None) -> int:
 def report_main(arguments: list[str] | None = None) -> int:
     """Run mappo-report: write a page of HTML about runs; return the exit code."""
     return _run("report", arguments)
+
+
+def hub_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-hub: bring policies to the Hugging Face hub, and from there; return the exit code."""
+    return _run("hub", arguments)
 
 
 def player_main(arguments: list[str] | None = None) -> int:

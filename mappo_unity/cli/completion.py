@@ -77,21 +77,32 @@ def _values(option: Option) -> list[str]:
     return null
 
 
-def _bash_script() -> str:
-    cases = []
+def _programs() -> dict[str, tuple[list[str], list[str]]]:
+    """Return what each program's arguments are; those of its own commands (mappo-hub push) together."""
+    programs: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
     for command in COMMANDS:
-        names, values = (" ".join(words) for words in completion_words(command))
-        cases.append(f"        {command}) names='{names}' values='{values}' ;;")
+        program, _, own = command.partition(" ")
+        names, values = programs.setdefault(program, ({}, {}))
+        more_names, more_values = completion_words(command)
+        names |= dict.fromkeys([own] * bool(own) + more_names)
+        values |= dict.fromkeys(more_values)
+    return {program: (list(names), list(values)) for program, (names, values) in programs.items()}
 
-    return _BASH.replace("@CASES@", "\n".join(cases)).replace("@COMMANDS@", " ".join(COMMANDS))
+
+def _bash_script() -> str:
+    programs = _programs()
+    cases = [
+        f"        {program}) names='{' '.join(names)}' values='{' '.join(values)}' ;;"
+        for program, (names, values) in programs.items()
+    ]
+    return _BASH.replace("@CASES@", "\n".join(cases)).replace("@COMMANDS@", " ".join(programs))
 
 
 def _fish_script() -> str:
     lines = [
         "# completion of the mappo-* commands; put into config.fish: mappo-train --completion fish | source"
     ]
-    for command in COMMANDS:
-        names, values = completion_words(command)
-        lines.append(f"complete -c {command} -a '{' '.join(names + values)}'")
+    for program, (names, values) in _programs().items():
+        lines.append(f"complete -c {program} -a '{' '.join(names + values)}'")
 
     return "\n".join(lines) + "\n"

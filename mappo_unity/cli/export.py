@@ -1,4 +1,4 @@
-"""mappo-export: write a trained policy as ONNX files."""
+"""mappo-export: write a trained policy as ONNX files, with a card beside each."""
 
 from __future__ import annotations
 
@@ -27,12 +27,20 @@ def run(lines: list[str]) -> int:
 
         # torch comes only now: mistakes in the options are told at once
         from mappo_unity.policies.export import export_checkpoint
+        from mappo_unity.sharing.beside import check_card, write_cards
 
-    checkpoint = choose_checkpoint(Path(options.run))
-    for file in export_checkpoint(checkpoint, Path(options.out) if options.out else None):
+        checkpoint = choose_checkpoint(Path(options.run))
+        check_card(options, checkpoint)
+
+    written = export_checkpoint(checkpoint, Path(options.out) if options.out else None)
+    for file in written:
         print(
             f"{file.path}: {file.policy} after {file.agent_steps:,} agent steps; plays as {checkpoint} does "
             f"(on {file.rows} observations: actions to {file.error:.1e}, samples in distribution)"
         )
+
+    if options.card:
+        for line in write_cards(checkpoint, written, options.episodes, options.video):
+            print(line)
 
     return 0

@@ -113,6 +113,22 @@ Examples:
 """
 
 
+HUB_USAGE = """\
+Bring trained policies to the Hugging Face hub with their cards, and from there. Extra [hub]; the token comes
+from HF_TOKEN or from `hf auth login`.
+
+Usage:
+  mappo-hub push WHAT repo=user/name [option=value ...]   a run (exported first), an ONNX file or a folder
+  mappo-hub pull user/name [option=value ...]             into a folder, which mappo-eval and mappo-play play
+  mappo-hub --help | --version
+
+Examples:
+  mappo-hub push outputs/3DBall/2026-11-20_12-00-00 repo=user/3DBall
+  mappo-hub push exported repo=user/WallJump private=true
+  mappo-hub pull user/3DBall out=policies/3DBall
+"""
+
+
 def train_help(schema: type) -> str:
     """Return the help of mappo-train: usage, choices, options."""
     choices = [_group_text(group) for group in all_groups()]
@@ -147,6 +163,11 @@ def plot_help(schema: type) -> str:
 def report_help(schema: type) -> str:
     """Return the help of mappo-report: usage, options."""
     return f"{REPORT_USAGE}\n{option_text(schema)}"
+
+
+def hub_help(push: type, pull: type) -> str:
+    """Return the help of mappo-hub: usage, options of push and of pull."""
+    return f"{HUB_USAGE}\nmappo-hub push\n{option_text(push)}\n\nmappo-hub pull\n{option_text(pull)}"
 
 
 def option_text(schema: type) -> str:

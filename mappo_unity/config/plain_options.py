@@ -21,6 +21,8 @@ from mappo_unity.config.schema import (
     LeagueConfig,
     PlayConfig,
     PlotConfig,
+    PullConfig,
+    PushConfig,
     ReportConfig,
 )
 from mappo_unity.config.text_lines import quoted_path
@@ -34,6 +36,8 @@ COMMANDS = {
     "mappo-league": LeagueConfig,
     "mappo-plot": PlotConfig,
     "mappo-report": ReportConfig,
+    "mappo-hub push": PushConfig,
+    "mappo-hub pull": PullConfig,
 }
 """The commands that take option=value, and their options."""
 

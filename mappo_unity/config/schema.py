@@ -991,11 +991,52 @@ class ExportConfig:
     """Run folder (its best checkpoint is exported) or checkpoint file; must be given."""
     out: Optional[str] = None
     """File (NAME.onnx) or folder to write; null: beside the checkpoint, under its name."""
+    card: bool = True
+    """Write a model card beside each file, NAME.md."""
+    episodes: Optional[int] = None
+    """Episodes to play for the score in the card; with two sides matches against random; null: none."""
+    video: bool = False
+    """Film the policy for the card, NAME.mp4, in an embedded scene; extra [video]."""
 
     def __post_init__(self) -> None:
         _not_empty(run=self.run)
         if self.out == "":
             raise ConfigError("out= is empty: it must name a file or a folder (null: beside the checkpoint)")
+        _at_least("episodes", self.episodes, 1)
+        if not self.card and (self.episodes is not None or self.video):
+            raise ConfigError("episodes and video=true are for the card, which card=false takes away")
+
+
+@dataclass
+class PushConfig:
+    """Options of an upload."""
+
+    what: str = "???"
+    """Run folder or checkpoint (exported first), ONNX file or a folder of them; before the options."""
+    repo: str = "???"
+    """Repository on the hub, user/name; made if it is not there."""
+    private: bool = False
+    """Make the repository private, if it is made; one that is there stays as it is."""
+    message: str = "Upload policies of mappo-unity"
+    """Message of the commit."""
+
+    def __post_init__(self) -> None:
+        _not_empty(what=self.what, repo=self.repo, message=self.message)
+
+
+@dataclass
+class PullConfig:
+    """Options of a download."""
+
+    repo: str = "???"
+    """Repository on the hub, user/name; before the options."""
+    out: Optional[str] = None
+    """New or empty folder to write; null: one with the name of the repository, here."""
+    revision: Optional[str] = None
+    """Branch, tag or commit; null: the newest of the main branch."""
+
+    def __post_init__(self) -> None:
+        _not_empty(repo=self.repo, out=self.out, revision=self.revision)
 
 
 @dataclass

@@ -1,0 +1,1 @@
+"""Trained policies for others: cards beside ONNX files, and the way to the Hugging Face hub and back."""
