@@ -50,6 +50,11 @@ def league_main(arguments: list[str] | None = None) -> int:
     return _run("league", arguments)
 
 
+def search_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-search: look for good options; return the exit code."""
+    return _run("search", arguments)
+
+
 def player_main(arguments: list[str] | None = None) -> int:
     """Run mappo-player: serve a scene as a Unity player; return the exit code."""
     return _run("player", arguments)

@@ -85,6 +85,21 @@ Examples:
 """
 
 
+SEARCH_USAGE = """\
+Look for good options: trials in several processes, chosen by Optuna (extra [search]), each an ordinary run.
+The same call goes on with the search in its folder; trials=N with a larger N adds to it.
+
+Usage:
+  mappo-search search=SPACE [option=value ...]   its own options, and any of mappo-train for all trials
+  mappo-search --help | --version
+
+Examples:
+  mappo-search search=ppo env=PushBlock trials=40 seeds=2 out=searches/push
+  mappo-search search=3DBall env=3DBall max_steps=250_000 goal=95 trials=20 workers=2 out=searches/ball
+  mappo-search search=my_space.yaml --config my.yaml trials=100
+"""
+
+
 def train_help(schema: type) -> str:
     """Return the help of mappo-train: usage, choices, options."""
     choices = [_group_text(group) for group in all_groups()]
@@ -109,6 +124,11 @@ def export_help(schema: type) -> str:
 def league_help(schema: type) -> str:
     """Return the help of mappo-league: usage, options."""
     return f"{LEAGUE_USAGE}\n{option_text(schema)}"
+
+
+def search_help(schema: type) -> str:
+    """Return the help of mappo-search: usage, spaces, options."""
+    return "\n".join([SEARCH_USAGE, "Spaces (conf/search/):", _group_text("search"), "", option_text(schema)])
 
 
 def option_text(schema: type) -> str:

@@ -1,7 +1,7 @@
 """Mistakes in the form of option=value, for the commands without presets.
 
-Those are mappo-eval, mappo-play, mappo-export and mappo-league. Switches, words alone and options given
-twice are told with how they are written.
+Those are mappo-eval, mappo-play, mappo-export, mappo-league, and mappo-search for its own options. Switches,
+words alone and options given twice are told with how they are written.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table
 from mappo_unity.config.overrides import parse, shell_word
 from mappo_unity.config.presets import group_choices
-from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, LeagueConfig, PlayConfig
+from mappo_unity.config.schema import Config, EvalConfig, ExportConfig, LeagueConfig, PlayConfig, SearchConfig
 from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
 
@@ -24,6 +24,7 @@ _COMMANDS = {
     "mappo-play": PlayConfig,
     "mappo-export": ExportConfig,
     "mappo-league": LeagueConfig,
+    "mappo-search": SearchConfig,
 }
 """The commands that take option=value, and their options."""
 
