@@ -66,9 +66,9 @@ def _trial_line(number: int, rows: list[Row], plan: SearchPlan) -> str:
 
     row = next(row for row in rows if row.number == number)
     ended = sum(row.status != "unfinished" for row in rows)
-    value = f"{_what(plan)} {show_number(row.value)}" if row.value is not None else row.error or ""
+    value = f"{_what(plan)} {show_number(_value(row))}" if row.value is not None else row.error or ""
     best = (
-        f"; best {show_number(rows[0].value)} (trial {rows[0].number})" if rows[0].value is not None else ""
+        f"; best {show_number(_value(rows[0]))} (trial {rows[0].number})" if rows[0].value is not None else ""
     )
     return f"{ended}/{plan.options.trials} trial {number} {row.status} {value}{best}  {' '.join(row.lines)}"
 
@@ -91,13 +91,18 @@ def _table(rows: list[Row], plan: SearchPlan) -> Table:
     for row in rows:
         options = dict(line.split("=", 1) for line in row.lines)
         values = [short_text(options.get(key, "")) for key in plan.space]
-        figures = map(show_number, (row.value, row.return_mean, row.agent_steps, row.wall_s))
+        figures = map(show_number, (_value(row), row.return_mean, row.agent_steps, row.wall_s))
         table.add_row(str(row.number), *values, *figures, row.status, row.error or "")
     return table
 
 
+def _value(row: Row) -> float | None:
+    """Return the value, decisions without decimals."""
+    return int(row.value) if row.value is not None and row.value.is_integer() else row.value
+
+
 def _what(plan: SearchPlan) -> str:
-    goal = plan.options.goal
+    goal = f"{plan.options.goal:g}" if plan.options.goal is not None else ""
     words = {
         "final_return": "final return",
         "decisions": f"decisions to {goal}",

@@ -72,6 +72,7 @@ def split_lines(lines: list[str]) -> tuple[list[str], list[str]]:
     for line in lines:
         key = line.partition("=")[0].lstrip("+~")
         is_known = key in own or key in group_choices() or find_option(table, key) is not None
+        is_known = is_known or key.startswith("hydra")  # refused with its own reason
         if "=" in line and not is_known and not line.startswith("-"):
             names = [*own, *group_choices(), *table]
             raise ConfigError(

@@ -117,8 +117,10 @@ def _entry(key: str, raw: Any) -> Range | Choices:
         raise ConfigError(f"{key} chooses presets, which are not searched: give one on the command line")
 
     option = find_option(option_table(Config), key)
-    if option is None or option.is_section:
+    if option is None:
         check_value(key, raw, Config)  # says which options there are
+        raise AssertionError(key)
+    if option.is_section:
         raise ConfigError(f"{key} is a section: name its options, {key}.NAME: {{low: 1, high: 2}}")
 
     if isinstance(raw, list):

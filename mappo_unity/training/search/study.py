@@ -126,7 +126,7 @@ def _storage(path: Path) -> JournalStorage:
 
 def _pruner(kind: Pruner) -> optuna.pruners.BasePruner:
     if kind is Pruner.median:
-        return optuna.pruners.MedianPruner(n_startup_trials=4, n_warmup_steps=MARKS // 4)
+        return optuna.pruners.MedianPruner(n_startup_trials=4, n_warmup_steps=MARKS // 2)
     if kind is Pruner.hyperband:
         return optuna.pruners.HyperbandPruner(min_resource=MARKS // 4, max_resource=MARKS)
     return optuna.pruners.NopPruner()
