@@ -26,7 +26,7 @@ Examples:
   mappo-train env=custom env.factory=package.module:function env.params.size=3
   mappo-train -m env=3DBall seed=0,1,2 ppo.lr=1e-4,3e-4
   mappo-train -m env=3DBall recipe=none,mappo_paper,benchmarl
-  mappo-train -m env=3DBall hydra/sweeper=optuna hydra.sweeper.n_trials=20 hydra/launcher=joblib
+  mappo-train -m env=3DBall seed=0,1,2 hydra/launcher=joblib
   mappo-train resume=outputs/3DBall/2026-11-20_12-00-00 max_steps=2000000
 """
 
