@@ -140,7 +140,7 @@ def _check_optuna() -> None:
     if not version or int(version.split(".")[0]) < _OPTUNA:
         here = f"here is {version}" if version else "which is not installed"
         raise ConfigError(
-            f"mappo-search needs the package optuna, {_OPTUNA} or newer, {here}: {install_command('search')}"
+            f"a search needs the package optuna, {_OPTUNA} or newer, {here}: {install_command('search')}"
         )
 
 
