@@ -124,7 +124,7 @@ def test_a_sweep_over_options_of_a_behavior(capsys: pytest.CaptureFixture[str]) 
         (["ppo.lr=interval(1e-4,1e-3)"], ["interval", "mappo-search"]),
         (["resume=x", "seed=1,2"], ["resume cannot be swept"]),
         (["hydra/sweeper=optuna", "seed=1,2"], ["hydra/sweeper=optuna was replaced by mappo-search"]),
-        (["hydra/sweeper=ax", "seed=1,2"], ["hydra/sweeper=ax: a sweep is a grid; mappo-search"]),
+        (["hydra/sweeper=ax", "seed=1,2"], ["hydra/sweeper=ax: a sweep is a grid; type mappo-search"]),
     ],
 )
 def test_wrong_options_start_no_job(

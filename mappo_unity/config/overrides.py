@@ -179,10 +179,7 @@ def _check_hydra(override: Override, line: str) -> None:
 
     if key == "hydra/sweeper" and override.value() != "basic":
         was = "hydra/sweeper=optuna was replaced by mappo-search" if "optuna" in line else "a sweep is a grid"
-        raise ConfigError(
-            f"{line}: {was}; mappo-search search=ppo trials=20 searches, with the same options for all trials"
-        )
-
+        raise ConfigError(f"{line}: {was}; type mappo-search search=ppo and the options of all trials")
     package, extra = SWEEP_EXTRA.get(line, ("", ""))
     if package and not is_installed(f"hydra_plugins.{package}"):
         raise ConfigError(
