@@ -126,6 +126,8 @@ def _train(run: Run, task: Task, marks: _Marks, job: JobResult) -> Outcome:
             write_record(run.folder, config, run.lines)
             check_factory(config.env)
             checkpoint = newest_good(run.folder)[0] if checkpoints_in(run.folder) else None
+            if checkpoint is None:  # killed before its first one: what it logged counts no more
+                (run.folder / "metrics.csv").unlink(missing_ok=True)
             outcome = train(config, run.folder, checkpoint, marks, Console(quiet=True))
     finally:
         job.wall_s = round(time.monotonic() - start_s, 3)
