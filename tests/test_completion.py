@@ -40,6 +40,8 @@ def test_bash_offers_presets_values_and_names() -> None:
     assert offers("mappo-train --conf") == ["--config"]
     assert offers("mappo-eval env=W") == ["Walker", "WallJump"]
     assert offers("mappo-export recipe") == []
+    assert offers("mappo-search trials") == ["trials="]
+    assert offers("mappo-search ppo.lr_f") == ["ppo.lr_final="]
     assert offers("mappo-hub pu") == ["push", "pull"]
     assert offers("mappo-hub push priv") == ["private="]
 

@@ -23,7 +23,11 @@ from mappo_unity.runs.folder import CONFIG, write_record
 from mappo_unity.runs.options import compose_resumed
 from mappo_unity.scenes.factory import check_factory
 
-FILES = sorted(path.relative_to(conf_dir()).as_posix() for path in conf_dir().rglob("*.yaml"))
+FILES = sorted(
+    path.relative_to(conf_dir()).as_posix()
+    for path in conf_dir().rglob("*.yaml")
+    if path.parent.name != "search"  # spaces, which test_search.py reads
+)
 FACTORY = "env.factory=test_compose:make_nothing"
 
 
@@ -266,7 +270,6 @@ def test_a_missing_sweep_package_names_the_extra(monkeypatch: pytest.MonkeyPatch
     for line, package, extra in (
         ("hydra/launcher=joblib", "hydra-joblib-launcher", "sweep"),
         ("hydra/launcher=submitit_slurm", "hydra-submitit-launcher", "slurm"),
-        ("hydra/sweeper=optuna", "hydra-optuna-sweeper", "sweep"),
     ):
         message = message_of([line])
         assert package in message and install_command(extra) in message

@@ -121,10 +121,10 @@ def test_a_sweep_over_options_of_a_behavior(capsys: pytest.CaptureFixture[str]) 
         (["env=3DBall,Nope"], ["env=Nope does not exist"]),
         (["sed=1,2"], ["did you mean seed"]),
         (["seed=0,1", "env.file_name=Game"], ["env.file_name=Game has no effect", "env.backend=player"]),
-        (["ppo.lr=interval(1e-4,1e-3)"], ["interval", "hydra/sweeper=optuna"]),
+        (["ppo.lr=interval(1e-4,1e-3)"], ["interval", "mappo-search"]),
         (["resume=x", "seed=1,2"], ["resume cannot be swept"]),
-        (["hydra/sweeper=optuna", "ppo.lr=interval(a,b)"], ["ppo.lr"]),
-        (["hydra/sweeper=optuna", "ppo.gamma=3"], ["ppo.gamma=3", "from 0 to 1"]),
+        (["hydra/sweeper=optuna", "seed=1,2"], ["hydra/sweeper=optuna was replaced by mappo-search"]),
+        (["hydra/sweeper=ax", "seed=1,2"], ["hydra/sweeper=ax: a sweep is a grid; type mappo-search"]),
     ],
 )
 def test_wrong_options_start_no_job(
@@ -173,33 +173,6 @@ def test_a_grid_that_cannot_be_run_is_refused_at_once(lines: list[str], words: l
         assert word in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("n_trials=0", ["hydra.sweeper.n_trials=0 is out of range", ">= 1"]),
-        ("n_trials=-3", ["hydra.sweeper.n_trials=-3 is out of range", ">= 1"]),
-        ("n_jobs=0", ["hydra.sweeper.n_jobs=0 is out of range", ">= 1"]),
-        ("max_failure_rate=2", ["hydra.sweeper.max_failure_rate=2.0", "from 0 to 1"]),
-        ("direction=up", ["the sweep cannot start", "'minimize' or 'maximize'"]),
-    ],
-)
-def test_a_search_that_cannot_be_run_is_refused(line: str, words: list[str]) -> None:
-    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
-    with pytest.raises(ConfigError) as caught:
-        run_sweep(["hydra/sweeper=optuna", f"hydra.sweeper.{line}", "seed=range(0,100000)"])
-    assert not Path("outputs").exists()
-    for word in words:
-        assert word in str(caught.value)
-
-
-def test_a_search_turns_a_stream_on_whose_options_are_given() -> None:
-    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
-    lines = ["hydra/sweeper=optuna", "rewards.rnd.lr=1e-3"]
-    assert len(plan_jobs([*lines, "rewards.rnd.strength=interval(0.1,1)"]).jobs) == 1
-    with pytest.raises(ConfigError, match="rewards.rnd.lr=0.001 has no effect without rewards.rnd.strength"):
-        plan_jobs([*lines, "ppo.lr=interval(0.001,0.01)"])
-
-
 def test_no_processes_are_refused() -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     with pytest.raises(ConfigError, match="hydra.launcher.n_jobs=0 is out of range"):
@@ -227,33 +200,6 @@ def test_a_long_check_is_announced_and_finds_each_jobs_own_options() -> None:
 def test_presets_are_chosen_by_their_names() -> None:
     jobs = plan_jobs(["recipe=glob(m*)"]).jobs
     assert jobs == [["recipe=mappo_paper"], ["recipe=mlagents"]]
-
-
-def test_optuna_searches_for_the_best_return(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
-    command = [
-        "hydra/sweeper=optuna",
-        "hydra.sweeper.n_trials=4",
-        "ppo.lr=interval(0.001,0.01)",
-        "ppo.gamma=0.9",
-    ]
-    assert train_main(["-m", *command]) == 0
-    rows = results(only_sweep())
-    rates = [float(row["ppo.lr"]) for row in rows]
-    assert len(rates) == 4 and rates == sorted(rates) and 0.001 <= rates[0] <= rates[-1] <= 0.01
-    assert {row["ppo.gamma"] for row in rows} == {"0.9"}
-    assert len({row["ppo.entropy_coef"] for row in rows}) == 4  # searched by the preset
-    text = (only_sweep() / "optimization_results.yaml").read_text()
-    assert rows[0]["ppo.lr"] in text  # the best is the one with the highest return
-
-
-def test_a_failed_trial_ends_no_search() -> None:
-    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
-    result = run_sweep(
-        ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=3", "hydra.sweeper.n_jobs=1", "seed=13"]
-    )
-    assert [job.status for job in result.jobs] == ["failed"] * 3
-    assert result.exit_code == 1
 
 
 def start_with_fake_training(tmp_path: Path, *lines: str) -> subprocess.Popen[str]:
@@ -305,17 +251,6 @@ def test_joblib_waits_for_the_checkpoints_of_its_jobs(
     status = {row["seed"]: row["status"] for row in results(only_sweep())}
     assert status == {"91": "interrupted", "92": "interrupted", "93": "no result"}
     assert len(list(only_sweep().rglob("checkpoint"))) == 2
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals of process groups")
-def test_a_search_of_processes_ends_by_its_signal(tmp_path: Path) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
-    lines = ["hydra/launcher=joblib", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=6", "seed=91"]
-    process = start_with_fake_training(tmp_path, *lines)
-    errors = interrupt_two_jobs(process, tmp_path, os.killpg, signal.SIGINT)
-    assert process.returncode == 130 and "Traceback" not in errors, errors
-    assert {row["status"] for row in results(only_sweep())} == {"interrupted"}
 
 
 def test_a_second_signal_waits_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -323,7 +323,7 @@ def test_a_recipe_brings_its_own_options_of_the_env_when_a_run_goes_on(training:
     ("line", "words"),
     [
         ("hydra/launcher=null", ["hydra/launcher=null does not exist", "choices: basic, joblib"]),
-        ("hydra/sweeper=[basic]", ["hydra/sweeper=[basic] does not exist", "choices: basic, optuna"]),
+        ("hydra/sweeper=[basic]", ["hydra/sweeper=[basic] does not exist", "choices: basic"]),
         ("env=null", ["env=null does not exist", "choices: 3DBall"]),
         ("+recipe=mlagents", ["recipe is chosen without signs: recipe=mlagents"]),
         ("~recipe", ["recipe is chosen without signs"]),

@@ -70,6 +70,11 @@ def hub_main(arguments: list[str] | None = None) -> int:
     return _run("hub", arguments)
 
 
+def search_main(arguments: list[str] | None = None) -> int:
+    """Run mappo-search: look for good options; return the exit code."""
+    return _run("search", arguments)
+
+
 def player_main(arguments: list[str] | None = None) -> int:
     """Run mappo-player: serve a scene as a Unity player; return the exit code."""
     return _run("player", arguments)

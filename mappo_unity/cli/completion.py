@@ -54,10 +54,13 @@ def completion_script(shell: str) -> str:
 
 def completion_words(command: str) -> tuple[list[str], list[str]]:
     """Return what a command's arguments begin with (``env=``), and those with a value (``env=3DBall``)."""
-    options = [option for option in option_table(COMMANDS[command]).values() if not option.is_section]
-    values = {option.key: _values(option) for option in options}
+    table = option_table(COMMANDS[command])
+    trains = command in ("mappo-train", "mappo-search")
+    if trains:  # a search takes its own options, and those of its trials
+        table = table | option_table(COMMANDS["mappo-train"])
+    values = {option.key: _values(option) for option in table.values() if not option.is_section}
 
-    if command == "mappo-train":
+    if trains:
         values |= {group: list(describe_choices(group)) for group in all_groups()}
     elif "env" in values:  # a preset's name
         values["env"] = group_choices()["env"]

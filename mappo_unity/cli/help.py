@@ -27,7 +27,7 @@ Examples:
   mappo-train env=custom env.factory=package.module:function env.params.size=3
   mappo-train -m env=3DBall seed=0,1,2 ppo.lr=1e-4,3e-4
   mappo-train -m env=3DBall recipe=none,mappo_paper,benchmarl
-  mappo-train -m env=3DBall hydra/sweeper=optuna hydra.sweeper.n_trials=20 hydra/launcher=joblib
+  mappo-train -m env=3DBall seed=0,1,2 hydra/launcher=joblib
   mappo-train resume=outputs/3DBall/2026-11-20_12-00-00 max_steps=2000000
 """
 
@@ -129,6 +129,21 @@ Examples:
 """
 
 
+SEARCH_USAGE = """\
+Look for good options: trials in several processes, chosen by Optuna (extra [search]), each an ordinary run.
+The same call goes on with the search in its folder; trials=N with a larger N adds to it.
+
+Usage:
+  mappo-search search=SPACE [option=value ...]   its own options, and any of mappo-train for all trials
+  mappo-search --help | --version
+
+Examples:
+  mappo-search search=ppo env=PushBlock trials=40 seeds=2 out=searches/push
+  mappo-search search=3DBall env=3DBall max_steps=250_000 goal=95 trials=20 workers=2 out=searches/ball
+  mappo-search search=my_space.yaml --config my.yaml trials=100
+"""
+
+
 def train_help(schema: type) -> str:
     """Return the help of mappo-train: usage, choices, options."""
     choices = [_group_text(group) for group in all_groups()]
@@ -168,6 +183,11 @@ def report_help(schema: type) -> str:
 def hub_help(push: type, pull: type) -> str:
     """Return the help of mappo-hub: usage, options of push and of pull."""
     return f"{HUB_USAGE}\nmappo-hub push\n{option_text(push)}\n\nmappo-hub pull\n{option_text(pull)}"
+
+
+def search_help(schema: type) -> str:
+    """Return the help of mappo-search: usage, spaces, options."""
+    return "\n".join([SEARCH_USAGE, "Spaces (conf/search/):", _group_text("search"), "", option_text(schema)])
 
 
 def option_text(schema: type) -> str:

@@ -92,7 +92,7 @@ def sweep_table(result: SweepResult) -> Table:
     table.add_column("error", overflow="fold")
 
     for job in result.jobs:
-        values = [_short(job_options(job).get(option, "")) for option in options]
+        values = [short_text(job_options(job).get(option, "")) for option in options]
         table.add_row(str(job.job), *values, *_figures(job), job.status, job.error or "")
 
     return table
@@ -185,7 +185,8 @@ def _percent(share: float) -> str:
     return "-" if share != share else f"{100 * share:.3g} %"
 
 
-def _short(text: str) -> str:
+def short_text(text: str) -> str:
+    """Return a number of many digits with four of them; other texts as they are."""
     try:
         return f"{float(text):.4g}" if len(text) > 8 else text
     except ValueError:

@@ -14,7 +14,6 @@ SWEEP_EXTRA = {
     "hydra/launcher=joblib": ("hydra_joblib_launcher", "sweep"),
     "hydra/launcher=submitit_local": ("hydra_submitit_launcher", "slurm"),
     "hydra/launcher=submitit_slurm": ("hydra_submitit_launcher", "slurm"),
-    "hydra/sweeper=optuna": ("hydra_optuna_sweeper", "sweep"),
 }
 """Presets of conf/hydra that need a plugin: the plugin's package, and the extra that brings it."""
 

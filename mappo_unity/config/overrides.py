@@ -181,6 +181,9 @@ def _check_hydra(override: Override, line: str) -> None:
         choices = ", ".join(describe_choices(key)) or "see its documentation"
         raise ConfigError(f"{key}={show_value(override.value())} does not exist; choices: {choices}")
 
+    if key == "hydra/sweeper" and override.value() != "basic":
+        was = "hydra/sweeper=optuna was replaced by mappo-search" if "optuna" in line else "a sweep is a grid"
+        raise ConfigError(f"{line}: {was}; type mappo-search search=ppo and the options of all trials")
     package, extra = SWEEP_EXTRA.get(line, ("", ""))
     if package and not is_installed(f"hydra_plugins.{package}"):
         raise ConfigError(

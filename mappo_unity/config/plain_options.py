@@ -1,7 +1,8 @@
 """Mistakes in the form of option=value, for the commands without presets.
 
-Those are mappo-eval, mappo-play, mappo-export, mappo-league, mappo-plot and mappo-report. Switches, words
-alone and options given twice are told with how they are written.
+Those are mappo-eval, mappo-play, mappo-export, mappo-league, mappo-plot, mappo-report, mappo-hub, and
+mappo-search for its own options. Switches, words alone and options given twice are told with how they are
+written.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from mappo_unity.config.schema import (
     PullConfig,
     PushConfig,
     ReportConfig,
+    SearchConfig,
 )
 from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
@@ -38,6 +40,7 @@ COMMANDS = {
     "mappo-report": ReportConfig,
     "mappo-hub push": PushConfig,
     "mappo-hub pull": PullConfig,
+    "mappo-search": SearchConfig,
 }
 """The commands that take option=value, and their options."""
 

@@ -11,6 +11,9 @@ from pathlib import Path
 NO_CHOICE = "none"
 """The choice of a group that changes nothing; null means the same."""
 
+_OTHERS = ("hydra", "search")
+"""Folders of conf/ that hold no presets of a run; mappo-search reads the second."""
+
 _BASIC = {  # what Hydra brings itself, and takes by default
     "hydra/launcher": {"basic": "One job of a sweep after the other (the default)."},
     "hydra/sweeper": {"basic": "One job for each combination of the values given (the default)."},
@@ -35,10 +38,10 @@ def hint_of_installed_scene(group: str, name: str) -> str:
 
 @cache
 def group_choices() -> dict[str, list[str]]:
-    """Return the choices of every group under conf/ (Hydra's own groups left out), sorted."""
+    """Return the choices of every group under conf/ (Hydra's own and spaces to search left out), sorted."""
     groups = {}
 
-    for folder in sorted(path for path in conf_dir().iterdir() if path.is_dir() and path.name != "hydra"):
+    for folder in sorted(path for path in conf_dir().iterdir() if path.is_dir() and path.name not in _OTHERS):
         names = sorted((path.stem for path in folder.glob("*.yaml")), key=str.lower)
         if names:
             groups[folder.name] = names
@@ -50,7 +53,8 @@ def all_groups() -> list[str]:
     """Return every group under conf/ that a person chooses from, Hydra's own too: env first, Hydra's last."""
     conf = conf_dir()
     groups = {path.parent.relative_to(conf).as_posix() for path in conf.rglob("*.yaml")} - {"."}
-    groups = {group for group in groups if not group.startswith("official")}  # a recipe chooses there
+    # a recipe chooses from the one, mappo-search reads the other
+    groups = {group for group in groups if not group.startswith(("official", "search"))}
     return sorted(groups, key=lambda group: (group.startswith("hydra"), group != "env", group))
 
 

@@ -22,14 +22,13 @@ from mappo_unity.policies.first_checks import check_environment
 from mappo_unity.policies.warm_start.sources import adopt_file_options
 
 MANY = 200  # jobs whose check takes so long that it is announced
-_COUNTS = {"hydra.sweeper.n_trials": 1, "hydra.sweeper.n_jobs": 1, "hydra.sweeper.max_batch_size": 1}
-_FAILURES = "hydra.sweeper.max_failure_rate"
+_BATCH = "hydra.sweeper.max_batch_size"
 _PROCESSES = "hydra.launcher.n_jobs"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The overrides of each job of a grid and what comes of them; one job with what is fixed for a search."""
+    """The overrides of each job of a grid, and what comes of them."""
 
     jobs: list[list[str]]
     configs: list[Config]
@@ -50,15 +49,11 @@ def plan_jobs(
     task = all_to_hydra_syntax([line for line in lines if not is_hydra(line)])
     hydra = [line for line in lines if is_hydra(line)]
 
-    # Of a grid the sizes come first: one that is too large is refused before its jobs are listed.
-    if is_search(lines):
-        jobs = [[line for line in task if not parse([line])[0].is_sweep_override()]]
-        first = _compose_job(jobs[0], hydra, file)
-    else:
-        counts = _count_values(task)
-        first = _compose_job(_first_job(task), hydra, file)
-        _check_size(counts, first.config.max_jobs, say)
-        jobs = [list(job) for job in BasicSweeper.split_arguments(parse(task), None)[0]]
+    # the sizes come first: a grid that is too large is refused before its jobs are listed
+    counts = _count_values(task)
+    first = _compose_job(_first_job(task), hydra, file)
+    _check_size(counts, first.config.max_jobs, say)
+    jobs = [list(job) for job in BasicSweeper.split_arguments(parse(task), None)[0]]
 
     _check_plugins(first.tree)
     configs = _configs(jobs, hydra, file, first)
@@ -69,18 +64,8 @@ def plan_jobs(
     for config in {config.env.factory: config for config in configs}.values():
         check_environment(config)
 
-    # Whether an option has an effect depends on the backend, which such a search has not chosen yet.
-    if not is_search(lines) or not _sweeps_backend(task):
-        # what a search chooses stands in no job
-        given = task if is_search(lines) else dict.fromkeys(line for job in jobs for line in job)
-        check_effect(list(given), configs)
-
+    check_effect(list(dict.fromkeys(line for job in jobs for line in job)), configs)
     return Plan(jobs, configs, first)
-
-
-def is_search(lines: list[str]) -> bool:
-    """Return whether a sweeper other than Hydra's grid decides on the jobs."""
-    return last_value(lines, "hydra/sweeper") not in (None, "basic")
 
 
 def is_hydra(line: str) -> bool:
@@ -94,7 +79,7 @@ def _count_values(lines: list[str]) -> dict[str, int]:
     for line, override in zip(lines, parse(lines)):
         if override.is_sweep_override() and not override.is_discrete_sweep():
             raise ConfigError(
-                f"{line}: an interval has no list of values; search it with hydra/sweeper=optuna, "
+                f"{line}: an interval has no list of values; mappo-search searches one, "
                 f"or give values: {override.key_or_group}=a,b,c"
             )
 
@@ -132,22 +117,17 @@ def _check_size(counts: dict[str, int], limit: int, say: Callable[[str], None]) 
         sizes = " x ".join(f"{count:,} of {key}" for key, count in counts.items() if count > 1)
         raise ConfigError(
             f"the sweep has {number:,} jobs ({sizes}), more than max_jobs={limit}: give fewer values, search "
-            f"with hydra/sweeper=optuna, or raise the limit: max_jobs={number}"
+            f"with mappo-search, or raise the limit: max_jobs={number}"
         )
     if number > MANY:
         say(f"checking the options of {number:,} jobs ...")
 
 
 def _check_plugins(tree: DictConfig) -> None:
-    """Check the numbers of Hydra's sweepers and launchers, which themselves assert them or go wrong."""
-    for key, low in _COUNTS.items():
-        value = OmegaConf.select(tree, key)
-        if value is not None and not (isinstance(value, int) and value >= low):
-            raise ConfigError(f"{key}={value} is out of range: it must be a whole number >= {low}")
-
-    rate = OmegaConf.select(tree, _FAILURES)
-    if rate is not None and not 0 <= rate <= 1:
-        raise ConfigError(f"{_FAILURES}={rate} is out of range: it must be from 0 to 1")
+    """Check the numbers of Hydra's grid and launchers, which themselves assert them or go wrong."""
+    batch = OmegaConf.select(tree, _BATCH)
+    if batch is not None and not (isinstance(batch, int) and batch >= 1):
+        raise ConfigError(f"{_BATCH}={batch} is out of range: it must be a whole number >= 1")
     if OmegaConf.select(tree, _PROCESSES) == 0:
         raise ConfigError(f"{_PROCESSES}=0 is out of range: it must be >= 1, or -1 for one job a core")
 
@@ -215,8 +195,3 @@ def _named(make: Callable[[], Any], job: list[str]) -> Any:
         return make()
     except ConfigError as error:
         raise ConfigError(f"{error} (in the job {' '.join(job) or 'as given'})") from error
-
-
-def _sweeps_backend(lines: list[str]) -> bool:
-    swept = [item for item in parse(lines) if item.is_sweep_override()]
-    return any(item.key_or_group in ("env", "env.backend") for item in swept)

@@ -1,4 +1,4 @@
-"""Sweeps: many runs from one command line, through Hydra's sweepers and launchers.
+"""Sweeps: many runs from one command line, through Hydra's grid and its launchers.
 
 A sweep's folder holds a run folder for each job, with its result.json. A job that fails leaves the others
 alone.
@@ -7,7 +7,6 @@ alone.
 from __future__ import annotations
 
 import json
-import logging
 import math
 import signal
 import time
@@ -102,7 +101,7 @@ def run_sweep(lines: list[str], file: Path | None = None) -> SweepResult:
         discard_folder(folder)
         raise ConfigError(f"the sweep cannot start: {' '.join(str(error).split())}") from error
     except Exception as error:
-        if patience.number is None:  # else a search misses the jobs that were ended
+        if patience.number is None:  # else a launcher misses the jobs that were ended
             _refuse_unstarted(folder, error)
             traceback.print_exc()
             result.error = f"{type(error).__name__}: {error}"
@@ -195,14 +194,6 @@ def _train(config: Config, folder: Path, result: JobResult) -> int | None:
     return outcome.signal
 
 
-def _quieten() -> None:
-    """Keep the search's own log off the terminal: our table tells, and failed jobs tell themselves."""
-    import optuna
-
-    optuna.logging.set_verbosity(logging.WARNING)
-    logging.getLogger("hydra_plugins").setLevel(logging.ERROR)
-
-
 def _refuse_unstarted(folder: NewFolder, error: Exception) -> None:
     """Raise ConfigError where a sweep broke off before its first job: its plugins refuse their options so."""
     if any(path.is_dir() for path in folder.path.iterdir()):
@@ -215,16 +206,13 @@ def _refuse_unstarted(folder: NewFolder, error: Exception) -> None:
 
 
 def _launch(lines: list[str], file: Path | None) -> None:
-    if last_value(lines, "hydra/sweeper") == "optuna":
-        _quieten()
-
     # Hydra refuses to start where an earlier one of this process is left.
     GlobalHydra.instance().clear()
     search_path = create_config_search_path(str(conf_dir()))
     hydra = Hydra.create_main_hydra2("mappo-train", search_path)
     try:
         lines = [add_plus_prefix(line) for line in all_to_hydra_syntax(lines)]
-        if all(last_value(lines, key) in (None, "basic") for key in ("hydra/sweeper", "hydra/launcher")):
+        if last_value(lines, "hydra/launcher") in (None, "basic"):
             # Hydra composes a whole batch before its first job.
             lines = ["hydra.sweeper.max_batch_size=1", *lines]
 
@@ -247,7 +235,7 @@ def _read_results(folder: Path) -> list[JobResult]:
 def _missing(folder: Path, planned: list[list[str]]) -> list[JobResult]:
     """Return the jobs of a grid that left no result: not started, or their process died."""
     multirun = folder / _GRID
-    if not multirun.is_file():  # a search writes none: nobody knows its jobs beforehand
+    if not multirun.is_file():  # the launcher broke off before
         return []
 
     done = {job.job for job in _read_results(folder)}
