@@ -77,7 +77,8 @@ MEASURES = (
     Measure("WallJump", "BigWallJump", behavior_return("Big"), 0.86, "BigWallJump?team=0/return_mean"),
     Measure("Pyramids", "return", mean_return, 1.78),
     Measure("PushBlock", "return", mean_return, 4.7),
-    Measure("DungeonEscape", "share freed", group_return, 0.97, "group_return_mean"),
+    # Those who die for the group do not share in it: a policy that frees 96 % of the areas earns 0.60.
+    Measure("DungeonEscape", "group return", group_return, 0.61, "group_return_mean"),
     Measure("GridFoodCollector", "return", mean_return, 65.0),
     Measure("Walker", "return", mean_return, 1000.0),
     Measure("CooperativePushBlock", "group return", group_return, 11.0, "group_return_mean"),
