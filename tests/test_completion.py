@@ -35,7 +35,7 @@ def test_bash_offers_presets_values_and_names() -> None:
     assert offers("mappo-train seed=1 recipe=m") == ["mappo_paper", "mlagents"]
     assert offers("mappo-train model.memory=") == ["none", "lstm", "gru"]
     assert offers("mappo-train env.no_graphics=t") == ["true"]
-    assert offers("mappo-train hydra/sw") == ["hydra/sweeper="]
+    assert offers("mappo-train hydra/la") == ["hydra/launcher="]
     assert offers("mappo-train ppo.lr_f") == ["ppo.lr_final="]
     assert offers("mappo-train --conf") == ["--config"]
     assert offers("mappo-eval env=W") == ["Walker", "WallJump"]

@@ -99,10 +99,8 @@ def range_length(override: Override) -> int:
     assert isinstance(value, RangeSweep) and value.start is not None and value.stop is not None
 
     if not value.step or not all(map(math.isfinite, (value.start, value.stop, value.step))):
-        raise ConfigError(
-            f"{override.input_line}: the range has no end (from {value.start} to {value.stop} in steps of "
-            f"{value.step})"
-        )
+        steps = f"from {value.start} to {value.stop} in steps of {value.step}"
+        raise ConfigError(f"{override.input_line}: the range has no end ({steps})")
 
     # stop is not one of the values, as in Python's range
     return max(0, math.ceil((value.stop - value.start) / value.step))
@@ -277,9 +275,8 @@ def _unknown(key: str, table: dict[str, Option], groups: dict[str, list[str]]) -
 
 
 def _inside(section: str, table: dict[str, Option]) -> list[str]:
-    return [
-        name for name in table if section and name.startswith(section + ".") and not table[name].is_section
-    ]
+    below = [name for name in table if section and name.startswith(f"{section}.")]
+    return [name for name in below if not table[name].is_section]
 
 
 def _values(override: Override) -> Iterator[Any]:
