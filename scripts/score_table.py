@@ -189,8 +189,12 @@ def is_measured(scene: str, player: str) -> bool:
 
 
 def append_curve(measure: Measure, seed: int, metrics: list[dict[str, str]]) -> None:
-    """Append a run's curve, thinned out, in decisions and minutes."""
-    known = [row for row in metrics if row.get(measure.column) and row[measure.column] != "nan"]
+    """Append a run's curve, thinned out, in decisions and minutes, once 100 episodes have ended."""
+    known = [
+        row
+        for row in metrics
+        if float(row["episodes"]) >= 100 and row.get(measure.column) and row[measure.column] != "nan"
+    ]
     step = max(1, math.ceil(len(known) / POINTS))
     for row in [*known[::step], *known[-1:]]:
         point = {

@@ -1,10 +1,15 @@
 """Figures of finished episodes."""
 
+import math
+
 import numpy as np
 import pytest
 
+from mappo_unity.cli import train_main
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.policies.episodes import standard_error, summarize
+from mappo_unity.runs import checkpoint
+from mappo_unity.training.episode_stats import RecentEpisodes
 
 
 def test_episodes_of_agents_alone_have_the_textbook_s_standard_error():
@@ -19,3 +24,27 @@ def test_team_mates_are_not_counted_twice():
     figures = summarize([Episode(i, 0.0, value, 10, False, 1) for i, value in enumerate(twice)])
     assert figures["stderr"] == pytest.approx(standard_error(values, teams=True), rel=1e-6)
     assert figures["stderr"] == pytest.approx(1 / np.sqrt(8_000), rel=0.35)  # from 40 batches
+
+
+def ended(*returns: float) -> list[Episode]:
+    return [Episode(agent, value, 0.0, 7, False) for agent, value in enumerate(returns)]
+
+
+def test_the_first_few_episodes_to_end_are_no_score():
+    window = RecentEpisodes(4, ["Left", "Right"])
+    window.add({"Left": ended(1.0, 1.0, 1.0), "Right": []})
+    assert window.score() == -math.inf and window.summary()["return_mean"] == 1.0
+    window.add({"Left": [], "Right": ended(0.0)})  # behaviors count together: one may never ask again
+    assert window.score() == 0.75
+    window.forget()
+    assert window.score() == -math.inf
+
+
+def test_lucky_early_episodes_do_not_choose_the_best_checkpoint(tmp_path):
+    # Basic's first episodes to end are the lucky ones: 4 areas with one goal 3 steps away
+    lines = ["env=Basic", "env.num_areas=4", "collect.rounds=8", "ppo.minibatch_size=32", "model.hidden=[8]"]
+    lines += ["log.loggers=[]", "log.progress=false", "export_onnx=false", "checkpoint_interval=1"]
+    assert train_main([*lines, "max_steps=96", "log.return_window=1000", f"hydra.run.dir={tmp_path}"]) == 0
+    best = checkpoint.load(tmp_path / "checkpoints" / checkpoint.BEST)
+    assert 0 < best["window"]["total"] < 1000, "some episodes ended, and fewer than the window holds"
+    assert best["agent_steps"] == 96 and best["best_score"] == -math.inf

@@ -393,6 +393,7 @@ def test_each_behavior_has_a_file_of_its_own(shared: Path, tmp_path: Path, capsy
 
     # beside a file for all, null keeps the behavior's own shape
     lines = [line for line in WALLS if not line.startswith("model.")]
+    lines += ["behaviors.SmallWallJump.model.activation=tanh"]
     lines += [f"init_from={oracle / 'BigWallJump.onnx'}", "behaviors.SmallWallJump.init_from=null"]
     assert train_main([*lines, f"output_dir={tmp_path / 'two'}"]) == 0
     model = newest(tmp_path / "two")["model"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any
 
@@ -45,6 +46,14 @@ class RecentEpisodes:
     def reached(self, goal: float) -> bool:
         """Return whether the mean return over a full window is at least `goal`."""
         return self.full and self.summary()["return_mean"] >= goal
+
+    def score(self) -> float:
+        """Return the mean return, or minus infinity while fewer episodes have ended than the window holds.
+
+        The first to end are no sample: where success ends an episode, they are those that met it by luck.
+        """
+        count = sum(len(rows) for rows in self.recent.values())
+        return self.summary()["return_mean"] if count >= self.size else -math.inf
 
     def summary(self) -> dict[str, float]:
         """Return means over the window, over all behaviors and, if several, for each of them.

@@ -191,7 +191,7 @@ class RunState:
 
         Of demonstrations played back it says nothing; there the newest checkpoint has learnt most.
         """
-        return float(self.agent_steps) if self.cfg.bc.only else self.recent_episodes.summary()["return_mean"]
+        return float(self.agent_steps) if self.cfg.bc.only else self.recent_episodes.score()
 
     def is_best(self) -> bool:
         """Return whether the policy is the best so far: by `score`; where there are two sides, by matches.
@@ -200,7 +200,8 @@ class RunState:
         """
         if self.matches.two_sided and not self.cfg.bc.only:
             return self.matches.is_best(self.agent_steps)
-        return self.score() > self.best_score
+        score = self.score()  # while too few episodes have ended the newest policy has learnt most
+        return score > self.best_score or score == self.best_score == -math.inf
 
     # --- checkpoints
 
