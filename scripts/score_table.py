@@ -180,7 +180,10 @@ def evaluate(
         return mappo_eval(*lines, timeout_s=EVALUATION_S)
     except subprocess.TimeoutExpired:
         print(f"{measure.scene}, {player}: no {arguments.episodes} episodes in {EVALUATION_S} s", flush=True)
-        return None
+    except subprocess.CalledProcessError:
+        # what a file lacks (some of Unity's cannot be played without sampling) is one blank, not a run's end
+        print(f"{measure.scene}, {player}: not measured with deterministic={deterministic}", flush=True)
+    return None
 
 
 def is_measured(scene: str, player: str) -> bool:

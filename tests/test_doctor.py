@@ -202,11 +202,10 @@ def test_mistakes_in_the_options(capsys: Any) -> None:
     assert "--timeout-s" in capsys.readouterr().out
 
 
-def test_a_run_is_not_for_the_doctor(tmp_path: Path) -> None:
+def test_a_run_s_folder_alone_is_a_run_meant(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").touch()
-    for word in (str(tmp_path), f"run={tmp_path}"):
-        with pytest.raises(ConfigError, match=f"mappo-eval run={tmp_path} tries a run"):
-            diagnose([word], print)
+    with pytest.raises(ConfigError, match=f"did you mean run={tmp_path}"):
+        diagnose([str(tmp_path)], print)
 
 
 @pytest.mark.parametrize(

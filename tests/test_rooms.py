@@ -11,7 +11,7 @@ import mappo_unity
 PACKAGE = Path(mappo_unity.__file__).parent
 ROOMS = (
     *("errors", "keys", "signals", "config", "scenes", "protocol", "envs", "farama"),
-    *("learning", "runs", "reports", "policies", "viewing", "training", "sharing", "cli"),
+    *("learning", "runs", "reports", "diagnosis", "policies", "viewing", "training", "sharing", "cli"),
 )
 DOORS = ("__init__", "api", "player")
 """Modules at the top that stand outside the rooms and open any of them."""

@@ -1,7 +1,7 @@
 """mappo-doctor: look for what keeps a Unity game from being trained on, and say what cures it.
 
-The installation is always examined, a player or the Editor if it is named. The exit code is 0 when nothing
-fails.
+The installation is always examined, a player or the Editor if it is named; with ``run=FOLDER`` a training run
+instead. The exit code is 0 when nothing fails and nothing is found.
 """
 
 from __future__ import annotations
@@ -32,11 +32,14 @@ def run(lines: list[str]) -> int:
 
 
 def diagnose(arguments: Sequence[str], say: Say) -> int:
-    """Examine the installation and, if one is named, a player or the Editor; return the exit code.
+    """Examine the installation and, if one is named, a player or the Editor, or a run; return the exit code.
 
     Raises:
         ConfigError: a mistake in the options, or no such file.
     """
+    if any(argument.startswith("run=") for argument in arguments):
+        return _diagnose_runs(arguments, say)
+
     options = _parser().parse_args(arguments)
 
     check_range("--port", options.port, 1, 65535)
@@ -63,6 +66,14 @@ def diagnose(arguments: Sequence[str], say: Say) -> int:
 
     report.head(f"{report.failures} failed, {report.warnings} to look at")
     return 1 if report.failures else 0
+
+
+def _diagnose_runs(arguments: Sequence[str], say: Say) -> int:
+    from mappo_unity.cli.examine.training_run import examine_runs
+
+    report = Report(say)
+    examine_runs(report, arguments)
+    return 1 if report.warnings else 0
 
 
 def examine_packages(report: Report) -> None:
@@ -122,7 +133,7 @@ class _Parser(Parser):
     """Tell also what a word alone was meant for."""
 
     def near(self, word: str) -> str:
-        """Return a hint: the near switch, --file-name for a path, mappo-eval for a run."""
+        """Return a hint: the near switch, --file-name for a path, run= for a run."""
         from mappo_unity.config.overrides import shell_word
 
         path = word.rpartition("=")[2]
@@ -130,9 +141,7 @@ class _Parser(Parser):
             return super().near(word)
 
         if (Path(path) / "config.yaml").is_file():
-            return (
-                f": it looks at the installation and at games; mappo-eval run={shell_word(path)} tries a run"
-            )
+            return f" (did you mean {shell_word(f'run={path}')}?)"
 
         return f" (did you mean --file-name {shell_word(path)}?)"
 
@@ -140,7 +149,10 @@ class _Parser(Parser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="mappo-doctor",
-        description="Find out what keeps a Unity game from being trained on.",
+        usage="mappo-doctor [OPTIONS]\n       mappo-doctor run=FOLDER ...",
+        description="Find out what keeps a Unity game from being trained on, or a run from learning.",
+        epilog="run=FOLDER looks at a run's observations, rewards, masks, episodes and updates, and "
+        "says what keeps it from learning; a folder of runs does, too. Exit code: 0 when nothing is found.",
         allow_abbrev=False,
     )
 

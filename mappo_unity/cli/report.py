@@ -18,9 +18,10 @@ def run(lines: list[str]) -> int:
     """Write the page; print where it is; return the exit code."""
     from mappo_unity.config.compose import compose_plain
     from mappo_unity.config.plain_options import take_words
+    from mappo_unity.diagnosis.diagnose import records
     from mappo_unity.reports.writing import write_report
 
     options = compose_plain(take_words(lines, ReportConfig, "runs"), ReportConfig)
-    out, count = write_report(options.runs, Path(options.out) if options.out else None)
+    out, count = write_report(options.runs, Path(options.out) if options.out else None, records)
     print(f"{out}: {count} run{'s' if count > 1 else ''}, {out.stat().st_size / 1e6:.1f} MB")
     return 0

@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.reports.figure import check_place
+from mappo_unity.reports.groups import run_names
 from mappo_unity.reports.page import report_page
-from mappo_unity.reports.reading import read_runs
+from mappo_unity.reports.reading import Run, read_runs
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.folder import find_run
 
 PAGE = "report.html"
+Diagnosis = Callable[[Sequence[Run], Sequence[str]], Sequence[dict[str, str]]]
+"""Findings about runs, which have these names."""
 
 
 def write_report(
-    paths: Sequence[str], out: Path | None = None, findings: Sequence[Mapping[str, Any]] = ()
+    paths: Sequence[str], out: Path | None = None, diagnosis: Diagnosis | None = None
 ) -> tuple[Path, int]:
     """Write the page about the runs of folders; return its path and how many runs are in it.
 
     Args:
         paths: run folders, folders of runs.
         out: the page; None: report.html in the folder, where there is a single one.
-        findings: see `report_page`.
+        diagnosis: returns findings about the runs, as `report_page` takes them; None: the page has none.
 
     Raises:
         ConfigError: a path leads to no run with metrics, or the page cannot be written.
@@ -43,6 +45,7 @@ def write_report(
     env = dict.fromkeys(run.options["env.name"] for run in runs)
     named = top.resolve().name if len(paths) == 1 else f"{len(paths)} folders"
     try:
+        findings = diagnosis(runs, run_names(runs)) if diagnosis is not None else []
         write_atomically(out, report_page(runs, f"{', '.join(env)}: {named}", notes, findings).encode())
     except OSError as error:
         raise ConfigError(f"out={out} cannot be written ({error.strerror or error})") from error

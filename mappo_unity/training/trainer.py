@@ -14,6 +14,7 @@ from pathlib import Path
 from rich.console import Console
 
 from mappo_unity.config.schema import Config
+from mappo_unity.diagnosis.watch import Watch
 from mappo_unity.envs.statistics import with_statistics
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
@@ -77,12 +78,14 @@ def train(
             exports = RunExports(folder, log.message) if cfg.export_onnx else None
             saver = CheckpointSaver(cfg, folder, state, exports, resume_from)
             stop = StopSignals(log.message)
+            specs = {name: setup.env.behaviors[sides[0]].spec for name, sides in setup.env.sides.items()}
+            watch = Watch(folder, specs, setup.env.sides)
 
             with setup.collecting() as batches, stop.taken():
                 state.restore_rng()
                 state.begin()
                 try:
-                    status = _iterate(cfg, batches, state, saver, log, stop, after_iteration)
+                    status = _iterate(cfg, batches, state, saver, log, watch, stop, after_iteration)
                     saver.finish()
                 except BaseException as error:
                     with stop.ignored():
@@ -99,6 +102,7 @@ def _iterate(
     state: RunState,
     saver: CheckpointSaver,
     log: RunLog,
+    watch: Watch,
     stop: StopSignals,
     after_iteration: AfterIteration | None,
 ) -> str:
@@ -110,6 +114,7 @@ def _iterate(
         collected_s = time.perf_counter()
 
         crashed = state.count_crashed(batch)
+        watch.add(batch.rounds, batch.episodes)
         learned = state.setup.learn(batch, progress=state.agent_steps / cfg.max_steps)
         learned_s = time.perf_counter()
 
@@ -131,13 +136,14 @@ def _iterate(
             saver.complete_matches()
         finally:  # a series that fails costs no row
             log.log(*with_statistics(row | series, statistics))
-        if series:
-            log.message(state.matches.said)
+        for text in watch.news() + ([state.matches.said] if series else []):
+            log.message(text)
 
         # The best weights are those that won the series, not those of a later checkpoint.
         saver.save_if_due(won=bool(series) and state.is_best())
         status = (after_iteration(state) if after_iteration else None) or _status(cfg, state, stop)
 
+    watch.write()
     # the loop is over: the timer of a first signal must not break off the last checkpoint
     stop.end_patience()
     return status
