@@ -160,7 +160,7 @@ def recorded_scene(seed: int = 0) -> Any:
 
 
 class Episodes:
-    """Write a line for each episode of a BaseEnv: decisions asked for so far, own and group return."""
+    """Write a line for each episode of a BaseEnv: decisions so far, own and group return, seconds (Unix)."""
 
     def __init__(self, env: Any, path: Path) -> None:
         self._env, self._step, self._reset = env, env.step, env.reset
@@ -190,14 +190,14 @@ class Episodes:
                 if steps is terminal:
                     for agent in steps.agent_id.tolist():
                         own, group = self._earned.pop(agent)
-                        self._file.write(f"{self._decisions},{own:.6g},{group:.6g}\n")
+                        self._file.write(f"{self._decisions},{own:.6g},{group:.6g},{time.time():.2f}\n")
             self._decisions += len(decision)
 
 
 def episodes(folder: Path) -> list[tuple[int, float]]:
     """Return the decisions at which each episode of a run ended, and its return."""
     with open(folder / "episodes.csv") as file:
-        return [(int(at), float(own) + float(group)) for at, own, group in csv.reader(file)]
+        return [(int(at), float(own) + float(group)) for at, own, group, *_ in csv.reader(file)]
 
 
 def last_return(folder: Path, limit: int) -> float:

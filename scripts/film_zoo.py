@@ -1,0 +1,60 @@
+#!/usr/bin/env python3
+"""Film the policies of the zoo into docs/scenes/NAME.gif, each of at most 850 kB.
+
+    python scripts/film_zoo.py [SCENE ...]
+
+Some seconds of one area from a fixed seed, by mappo-play; needs the extra [video]. A film that is too large
+is taken again, smaller or shorter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+from pathlib import Path
+
+from learn_scene import HERE
+
+from mappo_unity.keys import policy_name
+from mappo_unity.policies.policy_files import ZOO_FOLDER
+from mappo_unity.scenes import make_scene
+from mappo_unity.scenes.registry import BUILT_IN
+
+SIZES = ((384, 6), (320, 6), (272, 6), (240, 6), (240, 4))
+"""Widths, in the shape of docs/scenes/NAME.png, and seconds."""
+LARGEST = 850_000  # bytes
+PLACE = Path(__file__).resolve().parents[1] / "docs/scenes"
+
+
+def main() -> None:
+    """Film the scenes that are named, or all of which the zoo has every policy."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="*")
+    scenes = parser.parse_args().scenes or [name for name in BUILT_IN if is_in_zoo(name)]
+
+    for scene in scenes:
+        path = PLACE / f"{scene}.gif"
+        for width, seconds in SIZES:
+            height = round(width * 17 / 30 / 2) * 2
+            size = [f"width={width}", f"height={height}", f"seconds={seconds}", "seed=1"]
+            lines = [f"env={scene}", "policy=zoo", f"video={path}", *size]
+            subprocess.run([HERE / "mappo-play", *lines], check=True)
+            if path.stat().st_size <= LARGEST:
+                break
+        print(f"{path.name}: {width} x {height}, {seconds} s, {path.stat().st_size:,} bytes")
+
+
+def is_in_zoo(scene: str) -> bool:
+    """Return whether the zoo has a file for every behavior of a scene."""
+    env = make_scene(scene, num_areas=1)
+    try:
+        env.reset()
+        return all((ZOO_FOLDER / f"{policy_name(name)}.onnx").is_file() for name in env.behavior_specs)
+    finally:
+        env.close()
+
+
+if __name__ == "__main__":
+    main()

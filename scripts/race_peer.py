@@ -1,0 +1,242 @@
+#!/usr/bin/env python3
+"""Race the presets against the official mlagents-learn: the same minutes, the same machine, in turns.
+
+Three train a scene, one after the other, each for MINUTES of wall-clock, its start included: mlagents-learn
+with the official configuration through mappo-player, our preset through the same player, and our preset with
+the scene embedded. A run that ends by itself (max_steps) is over earlier. Returns through the player are
+those that the player itself notes; embedded ones are those of metrics.csv.
+
+    python scripts/race_peer.py --peer VENV/bin/mlagents-learn --official ml-agents/config \\
+        --scenes 3DBall=3 Basic=3 [--seeds 0] [--out outputs/race]
+    python scripts/race_peer.py --draw          # only the table docs/benchmarks/race.md and the picture
+
+What was measured stands in docs/benchmarks/race.csv, and is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from bench_peer import ROOT, make_player, their_command
+from learn_scene import append, read_rows
+
+from mappo_unity.runs.metrics_csv import read_metrics
+
+RACE = ROOT / "docs/benchmarks/race.csv"
+PAGE = ROOT / "docs/benchmarks/race.md"
+PEER, PLAYER, EMBEDDED = "mlagents-learn", "preset through the player", "preset embedded"
+COLORS = {PEER: "tab:orange", PLAYER: "tab:cyan", EMBEDDED: "tab:blue"}
+TARGETS = {"3DBall": 95.0, "Basic": 0.9, "DungeonEscape": 0.5, "Hallway": 0.7, "PushBlock": 4.5}
+"""Returns that show a scene learnt."""
+WINDOW = 100  # episodes of a mean
+POINTS = 60  # of a curve
+
+
+def main() -> None:
+    """Run what is missing, then write the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--peer", type=Path)
+    parser.add_argument("--official", type=Path, help="ML-Agents' folder config/, with ppo/ and poca/")
+    parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE=MINUTES")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--out", type=Path, default=Path("outputs/race"))
+    parser.add_argument("--draw", action="store_true", help="run nothing")
+    arguments = parser.parse_args()
+
+    for word in [] if arguments.draw else arguments.scenes:
+        scene, _, minutes = word.partition("=")
+        for seed in arguments.seeds:
+            # who begins changes, as the machine's load does
+            order = [PEER, PLAYER, EMBEDDED] if seed % 2 == 0 else [EMBEDDED, PLAYER, PEER]
+            for who in order:
+                race(arguments, scene, seed, who, 60 * float(minutes))
+
+    write_page()
+
+
+def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s: float) -> None:
+    """Let one train for its time, unless that has been done, and append its curve."""
+    if any((row["scene"], row["who"], int(row["seed"])) == (scene, who, seed) for row in read_rows(RACE)):
+        return
+    folder = arguments.out.resolve() / f"{scene}-{who.replace(' ', '_')}-{seed}"
+    shutil.rmtree(folder, ignore_errors=True)  # of a run that was cut off
+    folder.mkdir(parents=True)
+
+    command = command_of(arguments, scene, seed, who, folder)
+    load, start = os.getloadavg()[0], time.time()
+    seconds = run_for(command, folder / "log", limit_s)
+
+    points = embedded_curve(folder, start) if who == EMBEDDED else player_curve(folder, start)
+    facts = {
+        "limit": round(limit_s),
+        "seconds": round(seconds),
+        "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
+    }
+    for at_s, decisions, value in thin(points):
+        row = {"scene": scene, "who": who, "seed": seed, "second": round(at_s, 1), "decisions": decisions}
+        append(RACE, row | {"return": f"{value:.4g}"} | facts)
+    print(scene, who, seed, facts, points[-1:], flush=True)
+
+
+def command_of(arguments: argparse.Namespace, scene: str, seed: int, who: str, folder: Path) -> list[Any]:
+    """Return the command line of one of the three."""
+    if who == PEER:
+        arguments.steps = official_steps(arguments.official, scene)
+        return their_command(arguments, scene, seed, make_player(scene, folder), folder)
+
+    lines = [f"env={scene}", f"seed={seed}", "num_threads=1", f"hydra.run.dir={folder / 'run'}"]
+    if who == PLAYER:
+        player = make_player(scene, folder)
+        lines += [
+            "env.backend=player",
+            f"env.file_name={player}",
+            "env.no_graphics=true",
+            "env.num_areas=null",
+        ]
+    return [Path(sys.executable).parent / "mappo-train", *lines, "log.progress=false"]
+
+
+def official_steps(official: Path, scene: str) -> int:
+    """Return max_steps of the official configuration."""
+    import yaml
+
+    (path,) = official.glob(f"p*/{scene}.yaml")
+    behaviors = yaml.safe_load(path.read_text())["behaviors"]
+    return max(int(behavior["max_steps"]) for behavior in behaviors.values())
+
+
+def run_for(command: list[Any], log: Path, limit_s: float) -> float:
+    """Run a command for so long, then interrupt it; return the seconds that it had."""
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    start = time.monotonic()
+    with open(log, "w") as file:
+        process = subprocess.Popen(
+            list(map(str, command)),
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            start_new_session=True,
+        )
+        try:
+            code = process.wait(limit_s)
+            if code:
+                raise SystemExit(f"exit code {code}; the end of {log} says why")
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(60)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+            return limit_s
+    return time.monotonic() - start
+
+
+def player_curve(folder: Path, start: float) -> list[tuple[float, int, float]]:
+    """Return (seconds, decisions, mean return of the newest episodes) from what the player noted."""
+    with open(folder / "episodes.csv") as file:
+        rows = [(float(at), int(n), float(own) + float(group)) for n, own, group, at in csv.reader(file)]
+    points = []
+    for i in range(WINDOW - 1, len(rows), WINDOW // 4):
+        mean = statistics.mean(value for _, _, value in rows[i - WINDOW + 1 : i + 1])
+        points.append((rows[i][0] - start, rows[i][1], mean))
+    return points
+
+
+def embedded_curve(folder: Path, start: float) -> list[tuple[float, int, float]]:
+    """Return the same from metrics.csv; what a run does beside its iterations is put before them."""
+    path = folder / "run/metrics.csv"
+    rows = [row for row in read_metrics(path) if row["episodes"] >= WINDOW]
+    beside_s = path.stat().st_mtime - start - rows[-1]["wall_s"] if rows else 0.0
+    return [(row["wall_s"] + beside_s, int(row["agent_steps"]), row["return_mean"]) for row in rows]
+
+
+def thin(points: list[tuple[float, int, float]]) -> list[tuple[float, int, float]]:
+    """Return every so-manieth point and the last one."""
+    step = -(-len(points) // POINTS) or 1
+    return [*points[::step], *points[-1:]] if (len(points) - 1) % step else points[::step]
+
+
+def write_page() -> None:
+    """Write the table, and the picture if matplotlib is there."""
+    rows = read_rows(RACE)
+    runs: dict[tuple[str, str], dict[str, list[dict[str, str]]]] = {}
+    for row in rows:
+        runs.setdefault((row["scene"], row["seed"]), {}).setdefault(row["who"], []).append(row)
+
+    names = [PEER, PLAYER, EMBEDDED]
+    lines = [
+        f"| scene | seed | minutes | {' | '.join(names)} | seconds to the target | load |",
+        "|---" * 8 + "|",
+    ]
+    for (scene, seed), by_who in sorted(runs.items()):
+        cells = [f"{float(by_who[who][-1]['return']):.3g}" if who in by_who else "-" for who in names]
+        times = [reached(by_who.get(who, []), scene) for who in names]
+        limit = max(float(own[0]["limit"]) for own in by_who.values()) / 60
+        loads = " ".join(dict.fromkeys(own[0]["load"] for own in by_who.values()))
+        target = f"{TARGETS[scene]:g}: {', '.join(times)}" if scene in TARGETS else "-"
+        lines.append(f"| {scene} | {seed} | {limit:g} | {' | '.join(cells)} | {target} | {loads} |")
+
+    text = PAGE.read_text()
+    head, _, rest = text.partition("<!-- table -->\n")
+    tail = rest.partition("<!-- end -->\n")[2]
+    PAGE.write_text(head + "<!-- table -->\n" + "\n".join(lines) + "\n<!-- end -->\n" + tail)
+    print("\n".join(lines))
+    draw(runs)
+
+
+def reached(rows: list[dict[str, str]], scene: str) -> str:
+    """Return the second at which a curve first stood at the scene's target."""
+    hits = (row["second"] for row in rows if float(row["return"]) >= TARGETS.get(scene, float("inf")))
+    first = next(hits, None)
+    return f"{float(first):.0f}" if first is not None else "never"
+
+
+def draw(runs: dict[tuple[str, str], dict[str, list[dict[str, str]]]]) -> None:
+    """Draw a panel for each scene: return against minutes."""
+    try:
+        import matplotlib
+    except ImportError:
+        return
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    scenes = sorted({scene for scene, _ in runs})
+    if not scenes:
+        return
+    columns = min(2, len(scenes))
+    figure, axes = pyplot.subplots(
+        -(-len(scenes) // columns),
+        columns,
+        figsize=(5 * columns, 3.2 * -(-len(scenes) // columns)),
+        layout="constrained",
+        squeeze=False,
+    )
+    for axis, scene in zip(axes.flat, scenes):
+        for (name, _), by_who in runs.items():
+            for who, rows in by_who.items() if name == scene else ():
+                minutes = [float(row["second"]) / 60 for row in rows]
+                axis.plot(minutes, [float(row["return"]) for row in rows], color=COLORS[who], label=who)
+        handles = {label: handle for handle, label in zip(*axis.get_legend_handles_labels())}
+        axis.set(title=scene, xlabel="minutes", ylabel="return, last 100 episodes")
+        axis.grid(alpha=0.3)
+        axis.legend(handles.values(), handles.keys(), fontsize=8)
+    for axis in axes.flat[len(scenes) :]:
+        axis.remove()
+    figure.savefig(RACE.with_suffix(".png"), dpi=80)
+
+
+if __name__ == "__main__":
+    main()
