@@ -55,6 +55,7 @@ def simulated_device() -> Iterator[None]:
         "current_device": lambda: 0,
         "synchronize": lambda device=None: None,
         "Event": MagicMock(),
+        "cudart": MagicMock(),
         "manual_seed_all": lambda seed: state.fill_(seed % 251),
         "get_rng_state": lambda device=None: state.clone(),
         "get_rng_state_all": lambda: [state.clone()],

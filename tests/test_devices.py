@@ -26,6 +26,7 @@ from mappo_unity.learning.carried import CarriedRounds
 from mappo_unity.policies.matches import Score
 from mappo_unity.runs import checkpoint, rng
 from mappo_unity.training import match_series
+from mappo_unity.training.collection.slab import SharedBytes
 from mappo_unity.training.setup import check_device
 
 SMALL = ["collect.rounds=12", "ppo.minibatch_size=32", "ppo.epochs=2", "log.loggers=[]", "log.progress=false"]
@@ -126,6 +127,31 @@ def test_a_run_on_a_device_is_the_run_on_the_cpu(name: str, tmp_path: Path, monk
         found = train([*options(name), "device=cuda"], tmp_path / "device", code, cut=True)
     assert found == wanted and len(found) == 2
     assert (tmp_path / "device" / "checkpoints" / "final.onnx").is_file() == (name == "3DBall")
+
+
+def test_batches_of_processes_are_copied_from_pinned_memory(tmp_path: Path) -> None:
+    lines = [*BALL, "collect.workers=1", "max_steps=96"]
+    wanted = train(lines, tmp_path / "cpu")
+    with devices.simulated_device():
+        driver = torch.cuda.cudart()
+        driver.cudaHostRegister.return_value = 0
+        found = train([*lines, "device=cuda"], tmp_path / "device")
+        pinned = [call.args for call in driver.cudaHostRegister.call_args_list]
+        freed = [call.args[0] for call in driver.cudaHostUnregister.call_args_list]
+    assert found == wanted
+    assert pinned and all(size > 0 for _, size, _ in pinned)
+    assert sorted(address for address, _, _ in pinned) == sorted(freed)
+
+
+def test_memory_that_cannot_be_pinned_is_used_as_it_is() -> None:
+    with devices.simulated_device():
+        driver = torch.cuda.cudart()
+        driver.cudaHostRegister.return_value = 1  # cudaErrorInvalidValue
+        memory = SharedBytes(4096)
+        memory.pin()
+        memory.bytes[:] = 7
+        memory.close()
+    assert driver.cudaHostRegister.called and not driver.cudaHostUnregister.called
 
 
 def test_a_run_goes_on_on_another_device(tmp_path: Path) -> None:

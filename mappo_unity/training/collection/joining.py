@@ -56,12 +56,16 @@ def join_batches(
 
 
 def on_device(batch: Batch, device: str) -> Batch:
-    """Return a batch of the CPU with its tensors on a device."""
+    """Return a batch of the CPU with its tensors on a device.
+
+    From page-locked memory the rounds are copied while the CPU goes on. Workers write there again only after
+    the learner's figures were read, which waits for the device.
+    """
     if device == "cpu":
         return batch
     return replace(
         batch,
-        rounds=batch.rounds.to(device),
+        rounds=batch.rounds.to(device, non_blocking=True),
         following={name: part.to(device) for name, part in batch.following.items()},
         void={name: slots.to(device) for name, slots in batch.void.items()},
     )

@@ -61,6 +61,8 @@ class WorkerProcesses(RemoteWorkers):
                 capacity = ROOM * length
                 layout = make_layout(rows, self.parts, capacity)
                 slabs[capacity] = layout, SharedBytes(layout.size)
+                if self._cfg.device != "cpu":
+                    slabs[capacity][1].pin()
             layout, block = slabs[capacity]
             self.processes[number].send(SLAB, block.path, layout)
             kind, content = self.processes[number].receive()

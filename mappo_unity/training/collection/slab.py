@@ -41,11 +41,24 @@ class SharedBytes:
         os.ftruncate(self._file, size)  # pages that nobody writes to take no memory
         self.size = size
         self.bytes = open_bytes(self.path, size)
+        self._is_pinned = False
+
+    def pin(self) -> None:
+        """Lock its pages, so that a GPU copies from them by itself while the CPU goes on.
+
+        All of its pages take memory then. Where the driver refuses, copies are as without.
+        """
+        failed = torch.cuda.cudart().cudaHostRegister(self.bytes.data_ptr(), self.size, 0)
+        self._is_pinned = not int(failed)
 
     def close(self) -> None:
         """Give up the way to it; the memory goes with the last tensor that lies in it."""
         if self._file < 0:
             return
+        if self._is_pinned:
+            torch.cuda.synchronize()  # a copy may be under way
+            torch.cuda.cudart().cudaHostUnregister(self.bytes.data_ptr())
+            self._is_pinned = False
         os.close(self._file)
         self._file = -1
         if self._named is not None:
