@@ -84,7 +84,8 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
         "seconds": round(seconds),
         "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
     }
-    for at_s, decisions, value in thin(points):
+    # whoever is interrupted plays on while it saves
+    for at_s, decisions, value in thin([point for point in points if point[0] <= limit_s]):
         row = {"scene": scene, "who": who, "seed": seed, "second": round(at_s, 1), "decisions": decisions}
         append(RACE, row | {"return": f"{value:.4g}"} | facts)
     print(scene, who, seed, facts, points[-1:], flush=True)
@@ -171,7 +172,7 @@ def thin(points: list[tuple[float, int, float]]) -> list[tuple[float, int, float
 
 def write_page() -> None:
     """Write the table, and the picture if matplotlib is there."""
-    rows = read_rows(RACE)
+    rows = [row for row in read_rows(RACE) if float(row["second"]) <= float(row["limit"])]
     runs: dict[tuple[str, str], dict[str, list[dict[str, str]]]] = {}
     for row in rows:
         runs.setdefault((row["scene"], row["seed"]), {}).setdefault(row["who"], []).append(row)
@@ -199,6 +200,8 @@ def write_page() -> None:
 
 def reached(rows: list[dict[str, str]], scene: str) -> str:
     """Return the second at which a curve first stood at the scene's target."""
+    if not rows:
+        return "-"
     hits = (row["second"] for row in rows if float(row["return"]) >= TARGETS.get(scene, float("inf")))
     first = next(hits, None)
     return f"{float(first):.0f}" if first is not None else "never"

@@ -31,8 +31,8 @@ from mappo_unity.reports.dashboard import Answers, dashboard
 from mappo_unity.reports.groups import group_runs
 from mappo_unity.reports.page import report_page
 from mappo_unity.reports.parallel import parallel_coordinates
-from mappo_unity.reports.reading import Run, find_runs, read_run, read_runs
-from mappo_unity.reports.sections import seconds, status
+from mappo_unity.reports.reading import Run, default_options, find_runs, read_run, read_runs
+from mappo_unity.reports.sections import outcome, seconds, status
 from mappo_unity.reports.writing import write_report
 
 HOSTILE = "</script><script>alert(1)</script>&'\""
@@ -103,6 +103,19 @@ def test_a_run_without_metrics_is_left_out_with_a_note(tmp_path: Path) -> None:
     write_run(tmp_path / "b")
     runs, notes = read_runs([str(tmp_path)])
     assert [run.folder.name for run in runs] == ["a"] and notes == [f"{tmp_path / 'b'}: no metrics, left out"]
+
+
+def test_the_best_return_is_that_of_a_full_window() -> None:
+    columns = {
+        "agent_steps": [100.0, 200.0, 300.0, 400.0],
+        "return_mean": [9.0, 1.0, 3.0, 2.0],  # at first of a few lucky episodes
+        "episodes": [3.0, 99.0, 150.0, 200.0],
+        "wall_s": [1.0, 2.0, 3.0, 4.0],
+    }
+    arrays = {name: np.array(values) for name, values in columns.items()}
+    page = outcome([Run(Path("run"), default_options(), arrays, {}, [], {})])
+    cells = dict(re.findall("<dt>(.*?)</dt><dd>(.*?)</dd>", page))
+    assert (cells["best return"], cells["at decision"]) == ("3", "300")
 
 
 def test_cells_without_a_number_are_nan_and_damaged_records_cost_nothing(tmp_path: Path) -> None:

@@ -182,9 +182,17 @@ def _from_best(run: Run) -> float:
 
 
 def _best(run: Run) -> tuple[float, float]:
-    """Return the highest mean return and the decisions at which it was reached."""
+    """Return the highest mean return of a full window, where there was one, and the decisions then.
+
+    A window of the first few episodes to end holds the lucky ones (`RecentEpisodes.score`).
+    """
     column = run.columns.get("return_mean", np.empty(0))
     if not np.isfinite(column).any():
         return math.nan, math.nan
+
+    window = float(run.options.get("log.return_window", "1"))
+    is_full = run.columns.get("episodes", np.full(len(column), math.inf)) >= window
+    if np.isfinite(column[is_full]).any():
+        column = np.where(is_full, column, math.nan)
     row = int(np.nanargmax(column))
     return float(column[row]), float(run.columns["agent_steps"][row])
