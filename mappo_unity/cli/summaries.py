@@ -125,7 +125,8 @@ def eval_table(result: dict[str, Any]) -> Table:
 
     for name, value in _flat(result):
         above, dot, last = name.rpartition(".")
-        label = _LABELS.get(last, last.replace("_", " "))
+        # an option keeps the name by which it is set
+        label = last if above == "env.params" else _LABELS.get(last, last.replace("_", " "))
         table.add_row(above + dot + label, _percent(value) if last in _SHARES else show_number(value))
 
     return table

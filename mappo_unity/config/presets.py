@@ -59,7 +59,7 @@ def all_groups() -> list[str]:
 
 
 def describe_choices(group: str) -> dict[str, str]:
-    """Return a group's choices, each with the comment that its file begins with."""
+    """Return a group's choices, each with the first paragraph of its file's comment."""
     files = sorted((conf_dir() / group).glob("*.yaml"), key=lambda path: path.stem.lower())
     return {**_BASIC.get(group, {}), **{path.stem: _comment(path) for path in files}}
 
@@ -71,8 +71,11 @@ def _comment(path: Path) -> str:
         if not line.startswith("#"):
             break
 
-        # @package is meant for Hydra
+        # @package is meant for Hydra; what stands below an empty line, for readers of the file
+        text = line.lstrip("# ")
+        if lines and not text:
+            break
         if "@package" not in line:
-            lines.append(line.lstrip("# "))
+            lines.append(text)
 
     return " ".join(lines)
