@@ -5,6 +5,8 @@ Neither torch nor Hydra is imported, so that --help comes at once.
 
 from __future__ import annotations
 
+import os
+import shlex
 from functools import cache
 from pathlib import Path
 
@@ -34,6 +36,17 @@ def hint_of_installed_scene(group: str, name: str) -> str:
     if group != "env" or name not in (entry.name for entry in entry_points(group="mappo_unity.scenes")):
         return ""
     return f" as a preset; the installed scene: env=custom env.backend=embedded env.name={name}"
+
+
+def hint_of_word(word: str) -> str:
+    """Say what a word that stands alone may have been meant as; an empty text where nothing is near."""
+    for group, names in group_choices().items():
+        for name in names:
+            if name.lower() == word.lower():
+                return f" (did you mean {group}={name}?)"
+
+    is_path = os.path.exists(word)
+    return f" (did you mean {shlex.quote(f'resume={word}')}?)" if is_path else ""
 
 
 @cache
