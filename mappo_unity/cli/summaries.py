@@ -24,7 +24,13 @@ if TYPE_CHECKING:
     from mappo_unity.training.trainer import Outcome
 
 RESULTS = "results.csv"
-_LABELS = {"interrupted": "ended by the time limit", "stderr": "standard error of the mean"}
+_LABELS = {
+    "agent_steps": "agent steps of training",
+    "interrupted": "ended by the time limit",
+    "stderr": "standard error of the mean",
+    "won_of_decided_low95": "won of decided, 95 % from",
+    "won_of_decided_high95": "won of decided, 95 % to",
+}
 """What the table calls figures whose names in the JSON line say too little."""
 _SHARES = ("interrupted", "won_of_decided", "won_of_decided_low95", "won_of_decided_high95")
 """Figures that are shares from 0 to 1, and percentages in the table."""
@@ -121,7 +127,7 @@ def eval_table(result: dict[str, Any]) -> Table:
     """Return the figures of an evaluation as a table; nested ones by their dotted names."""
     table = Table(title="Evaluation")
     table.add_column("figure")
-    table.add_column("value", justify="right")
+    table.add_column("value", justify="right", overflow="fold")  # a path is there to be copied
 
     for name, value in _flat(result):
         above, dot, last = name.rpartition(".")
