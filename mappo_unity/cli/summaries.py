@@ -104,6 +104,16 @@ def sweep_table(result: SweepResult) -> Table:
     return table
 
 
+def sweep_summary(result: SweepResult) -> list[str]:
+    """Return the closing lines of a sweep: where it is, and what to type next where a job has trained."""
+    lines = [f"sweep folder: {result.folder}"]
+    if all(job.error for job in result.jobs):
+        return lines
+
+    folder = shell_word(result.folder)
+    return [*lines, f"report:       mappo-report {folder}", f"picture:      mappo-plot {folder}"]
+
+
 def write_csv(result: SweepResult) -> Path:
     """Write the jobs of a sweep, best first, to results.csv in its folder; return the path."""
     path = result.folder / RESULTS
