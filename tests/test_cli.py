@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
@@ -94,6 +95,26 @@ def test_help_lists_every_choice(capsys: pytest.CaptureFixture[str]) -> None:
     assert "hydra/launcher=basic|joblib" in text
     assert "ppo.lr: float = 0.0003" in text
     assert "model.hidden: [int] = [128,128]" in text
+
+
+def test_choices_are_described_in_a_sentence_or_two_without_their_name() -> None:
+    """What a preset's file says below the first paragraph of its comment is not for --help."""
+    for group in (*all_groups(), "search"):
+        for name, text in describe_choices(group).items():
+            assert 0 < len(text) < 240 and not text.startswith(f"{name}:"), f"{group}={name}: {text}"
+    assert describe_choices("env")["CooperativePushBlock"].endswith("(group reward)")
+
+
+@pytest.mark.parametrize("command", ["train", "eval", "play", "export", "league", "report", "hub", "search"])
+def test_examples_of_help_name_options_that_exist(command: str) -> None:
+    text = importlib.import_module(f"mappo_unity.cli.{command}").help_text()
+    known = {*re.findall(r"^  ([\w.]+): ", text, re.M), *option_table(Config), *all_groups()}
+
+    examples = text.split("Examples:\n")[1].split("\n\n")[0].splitlines()
+    assert all(line.startswith("  mappo-") for line in examples)
+    for line in examples:
+        for option in re.findall(r" ([\w./]+)=", line):
+            assert option in known or option.startswith("env.params."), line
 
 
 def test_a_mistake_is_told_without_torch(tmp_path: Path) -> None:
@@ -432,7 +453,7 @@ def test_evaluation_prints_a_table_and_one_line_of_json(
     train_main(["hydra.run.dir=mine"])
     capsys.readouterr()
     assert eval_main(["run=mine", "episodes=20", "deterministic=true"]) == 0
-    assert calls[0][0] == Path("mine")
+    assert calls[0][0] == "mine"
     assert calls[0][1].items() >= {"episodes": 20, "deterministic": True, "seed": 0, "opponent": None}.items()
     lines = capsys.readouterr().out.splitlines()
     assert json.loads(lines[-1]) == {

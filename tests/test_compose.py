@@ -173,6 +173,9 @@ def test_run_folder_is_named_by_env_and_by_the_user() -> None:
         ("env=custom", ["env.factory is not given", "package.module:function"]),
         ("env.factory=a.b", ["env.factory='a.b'", "package.module:function"]),
         ("seed", ["seed has no value", "seed=value"]),
+        ("3dball", ["3dball has no value", "did you mean env=3DBall?"]),
+        ("mappo_paper", ["did you mean recipe=mappo_paper?"]),
+        (str(Path(__file__).parent), [f"did you mean resume={Path(__file__).parent}?"]),
         ("a b=3", ["'a b=3'", "option=value"]),
         ("--cfg", ["--cfg is not an option", "option=value", "--help"]),
         (

@@ -1,6 +1,7 @@
 """mappo-learn: what ML-Agents' files and flags become, mistakes in them, and a run from end to end."""
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from mappo_unity.cli import learn_main
 from mappo_unity.config.compose import compose_config
-from mappo_unity.config.mlagents.flags import parse_flags
+from mappo_unity.config.mlagents.flags import flag_of, parse_flags
+from mappo_unity.config.mlagents.keys import RUN
 from mappo_unity.config.mlagents.read import read_settings
 from mappo_unity.config.mlagents.translate import translate
 from mappo_unity.config.per_behavior import behavior_config
@@ -44,6 +46,23 @@ behaviors:
     time_horizon: 1000
     summary_freq: 12000
 """
+
+
+def test_help_says_what_each_flag_does(capsys):
+    assert learn_main(["--help"]) == 0
+    text = capsys.readouterr().out
+    flags = [flag_of(key) for key in RUN if flag_of(key) in text]
+    assert len(flags) > 20
+    for flag in flags:  # its explanation stands behind it, or in the next line
+        assert re.search(rf"^  {flag}( VALUE| \.\.\.)?( {{2,}}|\n {{20,}})\w", text, re.M), flag
+
+
+def test_presets_of_ones_own_environment_are_no_scenes(tmp_path):
+    with pytest.raises(
+        ConfigError, match="there is no embedded scene 'pettingzoo'; scenes: 3DBall, Basic"
+    ) as caught:
+        translated(tmp_path, BALL, "--env=scene:pettingzoo")
+    assert "custom" not in str(caught.value) and "unity" not in str(caught.value)
 
 
 def translated(tmp_path, text, *flags):

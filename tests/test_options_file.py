@@ -121,7 +121,10 @@ def test_a_mistake_in_the_file_is_told(text: str, lines: list[str], words: list[
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
-        (["my.yaml"], ["my.yaml alone says nothing", "mappo-train --config my.yaml"]),
+        (
+            ["my.yaml"],
+            ["my.yaml alone says nothing", "mappo-train --config my.yaml", "as mappo-learn my.yaml"],
+        ),
         (["seed=1", "a b.yml"], ["mappo-train --config 'a b.yml'"]),
         (["--config"], ["--config names no file"]),
         (["--config="], ["--config names no file"]),

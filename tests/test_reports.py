@@ -277,7 +277,7 @@ def page_of(folder: Path, **options: Any) -> Page:
     return Page(report_page(read_runs([str(folder)])[0], "title", **options))
 
 
-def test_the_page_holds_what_metrics_csv_holds(tmp_path: Path) -> None:
+def test_the_page_holds_what_metrics_csv_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [
         {"agent_steps": 10 * row, "wall_s": row / 7, "return_mean": row**2 / 3, "SoccerTwos?team=1/x": -row}
         for row in range(50)
@@ -285,6 +285,8 @@ def test_the_page_holds_what_metrics_csv_holds(tmp_path: Path) -> None:
     rows[3]["return_mean"] = float("nan")
     write_run(tmp_path / "run", rows=rows)
     assert report_main([str(tmp_path / "run")]) == 0
+    size = round((tmp_path / "run" / "report.html").stat().st_size / 1000)
+    assert capsys.readouterr().out == f"{tmp_path / 'run' / 'report.html'}: 1 run, {size} kB\n"
     (run,) = Page((tmp_path / "run" / "report.html").read_text(encoding="utf-8")).data["runs"]
 
     with (tmp_path / "run" / "metrics.csv").open(newline="") as file:

@@ -101,3 +101,12 @@ def test_the_image_installs_what_the_project_asks_for() -> None:
     ignored = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
     assert {"pyproject.toml", "README.md", "LICENSE", "mappo_unity", "conf"} <= set(names)
     assert all((ROOT / name).exists() and f"!{name}" in ignored for name in names)
+
+
+def test_the_page_on_installing_has_every_extra_and_no_other() -> None:
+    section = PROJECT.split("[project.optional-dependencies]\n")[1].split("\n\n[")[0]
+    extras = re.findall(r"^(\w+) = ", section, re.M)
+
+    table = (ROOT / "docs" / "install.md").read_text(encoding="utf-8").split("## Extras")[1].split("\n## ")[0]
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", table, re.M))
+    assert len(extras) > 10 and sorted(rows) == sorted(extras)

@@ -35,5 +35,18 @@ def test_a_share_is_no_count() -> None:
     assert "50 %" in matches and "-" in matches
 
 
+def test_an_option_is_called_as_it_is_set() -> None:
+    text = printed({"env.params": {"ball_touch": 0.1}, "mean_return": 2.0})
+    assert "env.params.ball_touch" in text and "mean return" in text
+
+
+def test_a_path_is_whole_in_a_narrow_terminal() -> None:
+    path = "outputs/3DBall/2026-11-23_05-10-46/checkpoints/best.pt"
+    text = io.StringIO()
+    Console(file=text, width=60).print(eval_table({"policy": path, "agent_steps": 204800}))
+    values = [line.split("│")[2].strip() for line in text.getvalue().splitlines() if line.count("│") == 3]
+    assert "".join(values) == f"{path}204,800"
+
+
 def test_programs_read_the_same_names_as_before() -> None:
     assert json.loads(json_line(RESULT))["behaviors"]["Big?team=0"]["interrupted"] == 1.0

@@ -52,6 +52,7 @@ def test_a_grid_runs_every_combination_and_ranks_them(capsys: pytest.CaptureFixt
     assert [float(row["return_mean"]) for row in rows] == pytest.approx([0.9, 0.7, -0.1, -0.3])
     out = capsys.readouterr().out
     assert "best first" in out and str(folder) in out
+    assert f"\nreport:       mappo-report {folder}\npicture:      mappo-plot {folder}\n" in out
     assert "\n[job 2] half way\n" in out
     assert out.index("│   2 │ 1") < out.index("│   1 │ 0")
     for number in range(4):
@@ -77,6 +78,12 @@ def test_a_failed_job_stops_no_other(capsys: pytest.CaptureFixture[str]) -> None
     assert "unlucky" in rows[1]["error"]
     assert "RuntimeError: unlucky" in capsys.readouterr().err
     assert "unlucky" in (only_sweep() / "0" / "error.txt").read_text()
+
+
+def test_a_sweep_in_which_nothing_trained_has_no_report(capsys: pytest.CaptureFixture[str]) -> None:
+    assert train_main(["-m", "seed=13"]) == 1
+    out = capsys.readouterr().out
+    assert f"sweep folder: {only_sweep()}\n" in out and "mappo-report" not in out
 
 
 def test_a_signal_ends_the_sweep(capsys: pytest.CaptureFixture[str]) -> None:

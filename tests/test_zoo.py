@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 
 import pytest
 
@@ -38,9 +39,10 @@ def test_zoo_evaluates_as_its_card_says(capsys):
     assert eval_main(["run=zoo", "env=Basic", "episodes=20"]) == 0
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["mean_return"] == pytest.approx(0.93, abs=1e-6)  # the most that Basic pays
+    assert said["policy"] == "zoo"
 
 
-def test_a_folder_of_the_users_named_zoo_is_named_by_its_path(tmp_path, monkeypatch):
+def test_a_folder_of_the_users_named_zoo_is_named_by_its_path(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "zoo").mkdir()
     (tmp_path / "zoo" / "Own.onnx").write_bytes(b"")
@@ -48,6 +50,10 @@ def test_a_folder_of_the_users_named_zoo_is_named_by_its_path(tmp_path, monkeypa
     assert locate("zoo", "run").path == ZOO_FOLDER
     assert locate("./zoo", "run").path != ZOO_FOLDER
     assert locate("./zoo", "run").kind is Kind.onnx_folder
+
+    shutil.copy(ZOO_FOLDER / "Basic.onnx", tmp_path / "zoo")
+    assert eval_main(["run=./zoo", "env=Basic", "episodes=1"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["policy"] == "./zoo"
 
 
 def test_a_scene_without_a_file_in_the_zoo(tmp_path, capsys, monkeypatch):

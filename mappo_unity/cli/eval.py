@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from mappo_unity.config.schema import EvalConfig
@@ -27,7 +26,7 @@ def run(lines: list[str]) -> int:
         config = compose_plain(lines, EvalConfig)
         check_evaluation(config, params)
         options = vars(config)
-        where = Path(options.pop("run"))
+        where = options.pop("run")
 
         # torch comes only now: mistakes in the options are told at once
         from mappo_unity.policies.evaluate import evaluate

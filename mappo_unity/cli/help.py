@@ -15,16 +15,18 @@ TRAIN_USAGE = """\
 Train policies with MAPPO on an ML-Agents environment.
 
 Usage:
-  mappo-train [option=value ...]            train; the results are in outputs/<env>/<date>_<time>
-  mappo-train -m [option=value,value ...]   sweep: one run for each combination
-  mappo-train resume=RUN [option=value ...] resume a run folder or a checkpoint
+  mappo-train [option=value ...]                train; the results are in outputs/<env>/<date>_<time>
+  mappo-train -m [option=value,value ...]       sweep: one run for each combination
+  mappo-train resume=RUN [option=value ...]     resume a run folder or a checkpoint
   mappo-train --config FILE [option=value ...]  with the options of a YAML file, such as a run's config.yaml
-  mappo-train --completion bash|zsh|fish    print a script with which the shell completes options and presets
+  mappo-train --completion bash|zsh|fish        print a script with which the shell completes what is typed
   mappo-train --help | --version
 
 Examples:
   mappo-train env=3DBall seed=1
+  mappo-train env=unity env.file_name=builds/Game
   mappo-train env=custom env.factory=package.module:function env.params.size=3
+  mappo-train env=pettingzoo env.factory=mpe2.simple_spread_v3:parallel_env env.num_areas=32
   mappo-train -m env=3DBall seed=0,1,2 ppo.lr=1e-4,3e-4
   mappo-train -m env=3DBall recipe=none,mappo_paper,benchmarl
   mappo-train -m env=3DBall seed=0,1,2 hydra/launcher=joblib
@@ -42,6 +44,8 @@ Usage:
 Examples:
   mappo-eval run=outputs/3DBall/2026-11-20_12-00-00 episodes=100 deterministic=true
   mappo-eval run=outputs/3DBall/2026-11-20_12-00-00 env.params.mass=10   environment parameters of its scene
+  mappo-eval run=outputs/SoccerTwos/2026-11-20_12-00-00 opponent=random episodes=200
+  mappo-eval run=zoo env=Basic          a trained policy that the package brings
 """
 
 PLAY_USAGE = """\
@@ -57,6 +61,7 @@ Usage:
 Examples:
   mappo-play run=outputs/3DBall/2026-11-20_12-00-00 video=3DBall.mp4
   mappo-play env=SoccerTwos policy=SoccerTwos.onnx video=match.gif seconds=8 width=480 height=272
+  mappo-play env=PushBlock policy=zoo video=push.gif                a trained policy that the package brings
   mappo-play run=outputs/3DBall/2026-11-20_12-00-00 record=expert.demo seconds=300
 """
 
@@ -67,8 +72,9 @@ Usage:
   mappo-export run=RUN [out=PATH]           a run folder (its best checkpoint) or a checkpoint
   mappo-export --help | --version
 
-Example:
+Examples:
   mappo-export run=outputs/3DBall/2026-11-20_12-00-00 out=3DBall.onnx
+  mappo-export run=outputs/WallJump/2026-11-20_12-00-00 out=exported episodes=100    a file a behavior
 """
 
 LEAGUE_USAGE = """\

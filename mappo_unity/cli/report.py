@@ -23,5 +23,7 @@ def run(lines: list[str]) -> int:
 
     options = compose_plain(take_words(lines, ReportConfig, "runs"), ReportConfig)
     out, count = write_report(options.runs, Path(options.out) if options.out else None, records)
-    print(f"{out}: {count} run{'s' if count > 1 else ''}, {out.stat().st_size / 1e6:.1f} MB")
+    size = out.stat().st_size
+    amount = f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.0f} kB"
+    print(f"{out}: {count} run{'s' if count > 1 else ''}, {amount}")
     return 0

@@ -24,7 +24,13 @@ if TYPE_CHECKING:
     from mappo_unity.training.trainer import Outcome
 
 RESULTS = "results.csv"
-_LABELS = {"interrupted": "ended by the time limit", "stderr": "standard error of the mean"}
+_LABELS = {
+    "agent_steps": "agent steps of training",
+    "interrupted": "ended by the time limit",
+    "stderr": "standard error of the mean",
+    "won_of_decided_low95": "won of decided, 95 % from",
+    "won_of_decided_high95": "won of decided, 95 % to",
+}
 """What the table calls figures whose names in the JSON line say too little."""
 _SHARES = ("interrupted", "won_of_decided", "won_of_decided_low95", "won_of_decided_high95")
 """Figures that are shares from 0 to 1, and percentages in the table."""
@@ -98,6 +104,16 @@ def sweep_table(result: SweepResult) -> Table:
     return table
 
 
+def sweep_summary(result: SweepResult) -> list[str]:
+    """Return the closing lines of a sweep: where it is, and what to type next where a job has trained."""
+    lines = [f"sweep folder: {result.folder}"]
+    if all(job.error for job in result.jobs):
+        return lines
+
+    folder = shell_word(result.folder)
+    return [*lines, f"report:       mappo-report {folder}", f"picture:      mappo-plot {folder}"]
+
+
 def write_csv(result: SweepResult) -> Path:
     """Write the jobs of a sweep, best first, to results.csv in its folder; return the path."""
     path = result.folder / RESULTS
@@ -121,11 +137,12 @@ def eval_table(result: dict[str, Any]) -> Table:
     """Return the figures of an evaluation as a table; nested ones by their dotted names."""
     table = Table(title="Evaluation")
     table.add_column("figure")
-    table.add_column("value", justify="right")
+    table.add_column("value", justify="right", overflow="fold")  # a path is there to be copied
 
     for name, value in _flat(result):
         above, dot, last = name.rpartition(".")
-        label = _LABELS.get(last, last.replace("_", " "))
+        # an option keeps the name by which it is set
+        label = last if above == "env.params" else _LABELS.get(last, last.replace("_", " "))
         table.add_row(above + dot + label, _percent(value) if last in _SHARES else show_number(value))
 
     return table

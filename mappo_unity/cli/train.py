@@ -73,7 +73,8 @@ def _sweep(lines: list[str], file: Path | None) -> int:
 
     console = summaries.console()
     console.print(summaries.sweep_table(result))
-    console.print(f"sweep folder: {result.folder}", soft_wrap=True, highlight=False)
+    for line in summaries.sweep_summary(result):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
     for job in result.jobs:
         if job.error:

@@ -34,7 +34,10 @@ def take_file(lines: list[str]) -> tuple[list[str], Path | None]:
         if name == SWITCH:
             files.append(value if equals else next(left, ""))
         elif not equals and line.lower().endswith(_SUFFIXES):
-            raise ConfigError(f"{line} alone says nothing: a file of options is given as {_typed(line)}")
+            raise ConfigError(
+                f"{line} alone says nothing: a file of options is given as {_typed(line)}, ML-Agents' own "
+                f"configuration as mappo-learn {shell_word(line)}"
+            )
         else:
             rest.append(line)
 

@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mappo_unity.config.behavior_lines import to_hydra_syntax
 from mappo_unity.config.extras import SWEEP_EXTRA, install_command
 from mappo_unity.config.option_table import Option, did_you_mean, find_option, option_table, show_value
-from mappo_unity.config.presets import describe_choices, hint_of_installed_scene
+from mappo_unity.config.presets import describe_choices, hint_of_installed_scene, hint_of_word
 from mappo_unity.config.schema import Config
 from mappo_unity.config.text_lines import LINE, parse_or_none, quoted_path
 from mappo_unity.errors import ConfigError
@@ -166,9 +166,9 @@ def _parse_line(line: str) -> Override:
 def _check_form(text: str, line: str) -> None:
     match = LINE.fullmatch(text)
     if match is None:
-        raise ConfigError(f"{line!r} is not of the form option=value (for example seed=1)")
+        raise ConfigError(f"{line!r} is not of the form option=value (such as seed=1){hint_of_word(line)}")
     if match["rest"] is None and match["prefix"] != "~":
-        raise ConfigError(f"{line} has no value: write {match['key']}=value")
+        raise ConfigError(f"{line} has no value: write {match['key']}=value{hint_of_word(line)}")
 
 
 def _check_hydra(override: Override, line: str) -> None:

@@ -5,6 +5,8 @@ Neither torch nor Hydra is imported, so that --help comes at once.
 
 from __future__ import annotations
 
+import os
+import shlex
 from functools import cache
 from pathlib import Path
 
@@ -36,6 +38,17 @@ def hint_of_installed_scene(group: str, name: str) -> str:
     return f" as a preset; the installed scene: env=custom env.backend=embedded env.name={name}"
 
 
+def hint_of_word(word: str) -> str:
+    """Say what a word that stands alone may have been meant as; an empty text where nothing is near."""
+    for group, names in group_choices().items():
+        for name in names:
+            if name.lower() == word.lower():
+                return f" (did you mean {group}={name}?)"
+
+    is_path = os.path.exists(word)
+    return f" (did you mean {shlex.quote(f'resume={word}')}?)" if is_path else ""
+
+
 @cache
 def group_choices() -> dict[str, list[str]]:
     """Return the choices of every group under conf/ (Hydra's own and spaces to search left out), sorted."""
@@ -59,7 +72,7 @@ def all_groups() -> list[str]:
 
 
 def describe_choices(group: str) -> dict[str, str]:
-    """Return a group's choices, each with the comment that its file begins with."""
+    """Return a group's choices, each with the first paragraph of its file's comment."""
     files = sorted((conf_dir() / group).glob("*.yaml"), key=lambda path: path.stem.lower())
     return {**_BASIC.get(group, {}), **{path.stem: _comment(path) for path in files}}
 
@@ -71,8 +84,11 @@ def _comment(path: Path) -> str:
         if not line.startswith("#"):
             break
 
-        # @package is meant for Hydra
+        # @package is meant for Hydra; what stands below an empty line, for readers of the file
+        text = line.lstrip("# ")
+        if lines and not text:
+            break
         if "@package" not in line:
-            lines.append(line.lstrip("# "))
+            lines.append(text)
 
     return " ".join(lines)

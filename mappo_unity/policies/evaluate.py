@@ -20,7 +20,7 @@ from mappo_unity.runs.options import config_to_play
 
 
 def evaluate(
-    run: Path,
+    run: Path | str,
     episodes: int,
     deterministic: bool = False,
     seed: int = 0,
@@ -31,7 +31,7 @@ def evaluate(
     """Play a run's policy in its own environment, or in another.
 
     Args:
-        run: run folder (its best checkpoint plays, else its newest), a checkpoint or an ONNX file.
+        run: run folder (its best checkpoint plays, else its newest), checkpoint, ONNX file, zoo or ./zoo.
         episodes: agent episodes of every behavior; with an opponent, matches.
         opponent: "random", or another run, checkpoint or ONNX file, for environments with two sides.
         env: preset of the environment; None = that of the run.
@@ -48,10 +48,12 @@ def evaluate(
     torch.manual_seed(seed)
 
     policy = open_policy(str(run), deterministic, seed)
-    options = at_its_lessons(config_to_play(run, env, params).env, str(run))
+    options = at_its_lessons(config_to_play(Path(run), env, params).env, str(run))
     make_env = make_env_function(options)
 
-    head = {"policy": str(getattr(policy, "path", run)), "deterministic": deterministic, "seed": seed}
+    # which of a run's checkpoints it is; anything else as it was given
+    played = policy.path if isinstance(policy, CheckpointPolicy) else run
+    head: dict[str, Any] = {"policy": str(played), "deterministic": deterministic, "seed": seed}
     head |= _more_head(policy, options)
     if opponent is not None:
         other = open_policy(opponent, deterministic, seed, "opponent")

@@ -11,6 +11,18 @@ from mappo_unity.config.ranges import check_range
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.ports import EDITOR_PORT
 
+_DESCRIPTION = """\
+Serve a scene as a Unity player, to a trainer that listens on a port of this machine; or build an executable
+that does so when a trainer starts it. Other arguments of Unity players (-nographics, -batchmode ...) are
+accepted and have no effect.
+
+examples:
+  mappo-player 3DBall                                     to a trainer that waits for the Editor
+  mappo-player WallJump --mlagents-port 5005 --param big_wall_height=3
+  mappo-player build 3DBall builds                        writes builds/3DBall.x86_64
+  mappo-train env=unity env.file_name=builds/3DBall       trains on it
+"""
+
 
 def parse(lines: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     """Return the values (`params` by name), and the arguments that have no effect here.
@@ -77,8 +89,8 @@ def _parser() -> Parser:
     parser = Parser(
         prog="mappo-player",
         usage="mappo-player SCENE [--mlagents-port N] [options]   |   mappo-player build SCENE DIR [options]",
-        description="Serve a scene as a Unity player, to a trainer that listens on a port of this machine. "
-        "Other arguments of Unity players (-nographics, -batchmode ...) are accepted and have no effect.",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
 
@@ -99,7 +111,13 @@ def _parser() -> Parser:
         metavar="N",
         help="areas, whatever the trainer asks for",
     )
-    parser.add_argument("--param", action="append", default=[], metavar="NAME=NUMBER")
+    parser.add_argument(
+        "--param",
+        action="append",
+        default=[],
+        metavar="NAME=NUMBER",
+        help="environment parameter of the scene; may stand several times",
+    )
     parser.add_argument("--no-png", action="store_true", help="send pictures as floats")
 
     return parser

@@ -13,6 +13,8 @@ from mappo_unity.errors import ConfigError
 
 SCENE = "scene:"
 """Before the name of an embedded scene, in the place of a player's path."""
+_NO_SCENES = ("custom", "pettingzoo", "unity")
+"""Presets whose environment is the user's own."""
 MANY = 1_000_000
 """What stands for no limit."""
 
@@ -48,7 +50,7 @@ def environment_options(run: Section, warnings: list[str]) -> Options:
 
 
 def _scene(run: Section, scene: str, where: str, warnings: list[str]) -> Options:
-    scenes = [name for name in group_choices()["env"] if name not in ("custom", "unity")]
+    scenes = [name for name in group_choices()["env"] if name not in _NO_SCENES]
     if scene not in scenes:
         raise ConfigError(f"{where}: there is no embedded scene {scene!r}; scenes: {', '.join(scenes)}")
 

@@ -13,15 +13,44 @@ _ENV_ARGS = "--env-args"
 _OTHER_NAMES = {"env_settings.env_path": "--env", "torch_settings.device": "--torch-device"}
 _NO_FLAG = ("checkpoint_settings.load_model", "checkpoint_settings.train_model", "env_settings.env_args")
 _DEPRECATED = ("--load", "--train", "--torch", "--tensorflow")
+_NO_EFFECT = "no effect here"
 _HELP = {
     "env_settings.env_path": "Unity player; scene:NAME an embedded scene; none: the Editor, on port 5004",
+    "env_settings.base_port": _NO_EFFECT,
+    "env_settings.num_envs": "players that run side by side (1)",
+    "env_settings.num_areas": "areas in each player; of a scene, 1: as many as Unity has (1)",
+    "env_settings.timeout_wait": "seconds within which a player must connect, and must answer (60)",
+    "env_settings.seed": "seed of the environment, the networks and the sampling; -1: draw one (-1)",
+    "env_settings.max_lifetime_restarts": "times that a crashed player is started again; -1: always (10)",
+    "env_settings.restarts_rate_limit_n": _NO_EFFECT,
+    "env_settings.restarts_rate_limit_period_s": _NO_EFFECT,
+    "engine_settings.width": "width of a player's screen in pixels (84)",
+    "engine_settings.height": "height of a player's screen in pixels (84)",
+    "engine_settings.quality_level": "Unity's quality level (5)",
+    "engine_settings.time_scale": "how much faster than real time a player runs (20)",
+    "engine_settings.target_frame_rate": "frames a second that a player draws; -1: no limit (-1)",
+    "engine_settings.capture_frame_rate": _NO_EFFECT,
+    "engine_settings.no_graphics": "start players without graphics; cameras then see nothing",
+    "engine_settings.no_graphics_monitor": _NO_EFFECT,
     "checkpoint_settings.run_id": "name of the run's folder below the results (ppo)",
-    "checkpoint_settings.results_dir": "folder of the results (results)",
-    "checkpoint_settings.resume": "go on with the run of this name",
+    "checkpoint_settings.initialize_from": "begin with the networks of the run of this name",
+    "checkpoint_settings.resume": "resume the run of this name",
     "checkpoint_settings.force": "replace the run of this name",
-    "checkpoint_settings.initialize_from": "begin with the networks of another run",
-    "checkpoint_settings.inference": "play without training",
+    "checkpoint_settings.inference": "play 100 episodes of the run of this name, without training",
+    "checkpoint_settings.results_dir": "folder of the results (results)",
+    "torch_settings.device": "cpu, cuda or cuda:N (cpu)",
+    "debug": _NO_EFFECT,
 }
+_DESCRIPTION = """\
+Train with ML-Agents' configuration and flags (docs/from-mlagents.md).
+
+examples:
+  mappo-learn 3DBall.yaml --run-id=ball --env=builds/3DBall       a Unity build
+  mappo-learn 3DBall.yaml --run-id=ball                           the Editor: press Play
+  mappo-learn 3DBall.yaml --run-id=ball --env=scene:3DBall        an embedded scene, without Unity
+  mappo-learn 3DBall.yaml --run-id=ball --resume
+  mappo-learn 3DBall.yaml --env=scene:3DBall ppo.epochs=4         an option of mappo-train beats all
+"""
 
 
 @dataclass
@@ -90,12 +119,17 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="mappo-learn",
         usage="mappo-learn [CONFIG.yaml] [--run-id=NAME] [--env=PATH] [flags] [option=value ...]",
-        description="Train with ML-Agents' configuration and flags (docs/from-mlagents.md).",
+        description=_DESCRIPTION,
+        formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=34),
         add_help=False,
     )
     parser.add_argument("words", nargs="*", help=argparse.SUPPRESS)
     parser.add_argument("--help", "-h", action="store_true", help="show this text", default=argparse.SUPPRESS)
-    parser.add_argument("--print-options", action="store_true", help="print mappo-train's options and end")
+    parser.add_argument(
+        "--print-options",
+        action="store_true",
+        help="print the options of mappo-train that a file becomes, and end",
+    )
     parser.add_argument("--deterministic", action="store_true", help="with --inference: most likely actions")
 
     for key, about in RUN.items():
