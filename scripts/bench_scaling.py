@@ -17,11 +17,13 @@ import os
 import statistics
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.errors import ConfigError
 from mappo_unity.training.outcome import INTERRUPTED
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.trainer import train
@@ -60,7 +62,8 @@ def main() -> None:
                 options = [f"env={scene}", *QUIET, *ENDLESS, *arguments.option, *lines]
                 has_workers = any(line.startswith("collect.workers") for line in lines)
                 options += [f"collect.engine={arguments.engine}"] if has_workers else []
-                rates[name].append(measure(options, arguments.iterations))
+                with suppress(ConfigError):  # intrinsic rewards want one learner, for example
+                    rates[name].append(measure(options, arguments.iterations))
         print_table(scene, rates)
     print(f"load average {os.getloadavg()[0]:.2f}")
 
@@ -84,6 +87,9 @@ def print_table(scene: str, rates: dict[str, list[float]]) -> None:
     print(f"\n{scene}\n{'workers':14} {'decisions/s':>12}  ratio to 0 workers (least to most)")
     first = next(iter(rates.values()))
     for name, values in rates.items():
+        if not values:
+            print(f"{name:14}      refused")
+            continue
         ratios = [value / base for value, base in zip(values, first)]
         print(
             f"{name:14} {statistics.median(values):12,.0f}  {statistics.median(ratios):.2f} "

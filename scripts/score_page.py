@@ -57,7 +57,7 @@ def of(measure: Measure, rows: list[dict[str, str]]) -> list[dict[str, str]]:
 def table_row(measure: Measure, rows: list[dict[str, str]]) -> str:
     """Return the row of the table that compares a measure's policies."""
     own = of(measure, rows)
-    seeds = [row for row in own if row["policy"] not in FIXED]
+    seeds = sorted((row for row in own if row["policy"] not in FIXED), key=lambda row: int(row["policy"]))
     cells = [
         *(measure.scene, measure.name, f"{'<=' if measure.is_lower_better else '>='} {measure.target:g}"),
         both_ways(seeds),
@@ -103,7 +103,7 @@ def curves_of(scene: str, column: str) -> dict[str, list[Point]]:
         if (row["scene"], row["column"]) == (scene, column):
             point = float(row["decisions"]), float(row["minutes"]), float(row["value"])
             curves[row["seed"]].append(point)
-    return curves
+    return {seed: curves[seed] for seed in sorted(curves, key=int)}
 
 
 def draw_curves() -> list[str]:
