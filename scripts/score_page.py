@@ -118,7 +118,8 @@ def draw_curves() -> list[str]:
     PICTURES.mkdir(exist_ok=True)
     drawn = []
     for scene in dict.fromkeys(measure.scene for measure in MEASURES):
-        measures = list({m.column: m for m in MEASURES if m.scene == scene}.values())
+        # of several measures of one curve, the first is what it shows
+        measures = list({m.column: m for m in reversed(MEASURES) if m.scene == scene}.values())[::-1]
         shown = [measure for measure in measures if curves_of(scene, measure.column)]
         if shown:
             draw_scene(scene, shown, PICTURES / f"{scene}.png")
