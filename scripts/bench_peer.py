@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace, scene: str, seed: int, trainer: str) -> N
     if trainer == "mappo-unity":
         command = our_command(scene, seed, arguments.steps, player, folder) + arguments.options
     else:
-        command = their_command(arguments, scene, seed, player, folder)
+        command = their_command(arguments, scene, seed, arguments.steps, player, folder)
 
     print(f"{time.strftime('%H:%M:%S')} {shlex.join(map(str, command))}", flush=True)
     load, start = os.getloadavg()[0], time.monotonic()
@@ -130,15 +130,18 @@ def our_command(scene: str, seed: int, steps: int, player: Path, folder: Path) -
 
 
 def their_command(
-    arguments: argparse.Namespace, scene: str, seed: int, player: Path, folder: Path
+    arguments: argparse.Namespace, scene: str, seed: int, steps: int | None, player: Path, folder: Path
 ) -> list[Any]:
-    """Return the command line of mlagents-learn, with the official configuration but for max_steps."""
+    """Return the command line of mlagents-learn, with the official configuration but for max_steps.
+
+    `steps` takes that one's place; with None it stays, too.
+    """
     import yaml
 
     (official,) = arguments.official.glob(f"p*/{scene}.yaml")  # ppo/ or poca/
     configuration = yaml.safe_load(official.read_text())
-    for behavior in configuration["behaviors"].values():
-        behavior["max_steps"] = arguments.steps
+    for behavior in configuration["behaviors"].values() if steps is not None else ():
+        behavior["max_steps"] = steps
     path = folder / "configuration.yaml"
     path.write_text(yaml.safe_dump(configuration))
 

@@ -14,10 +14,9 @@ import subprocess
 from pathlib import Path
 
 from learn_scene import HERE
+from score_table import has_policies
 
-from mappo_unity.keys import policy_name
 from mappo_unity.policies.policy_files import ZOO_FOLDER
-from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.registry import BUILT_IN
 
 SIZES = ((384, 6), (320, 6), (272, 6), (240, 6), (240, 4))
@@ -32,7 +31,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="*")
-    scenes = parser.parse_args().scenes or [name for name in BUILT_IN if is_in_zoo(name)]
+    scenes = parser.parse_args().scenes or [name for name in BUILT_IN if has_policies(ZOO_FOLDER, name)]
 
     for scene in scenes:
         path = PLACE / f"{scene}.gif"
@@ -44,16 +43,6 @@ def main() -> None:
             if path.stat().st_size <= LARGEST:
                 break
         print(f"{path.name}: {width} x {height}, {seconds} s, {path.stat().st_size:,} bytes")
-
-
-def is_in_zoo(scene: str) -> bool:
-    """Return whether the zoo has a file for every behavior of a scene."""
-    env = make_scene(scene, num_areas=1)
-    try:
-        env.reset()
-        return all((ZOO_FOLDER / f"{policy_name(name)}.onnx").is_file() for name in env.behavior_specs)
-    finally:
-        env.close()
 
 
 if __name__ == "__main__":

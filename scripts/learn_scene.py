@@ -13,12 +13,16 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import math
 import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+Point = TypeVar("Point")
 
 HERE = Path(sys.executable).parent
 
@@ -96,6 +100,15 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return []
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
+
+
+def thin(points: Sequence[Point], most: int) -> list[Point]:
+    """Return some of a curve's points, evenly, and the last one: about as many as `most`."""
+    step = max(1, math.ceil(len(points) / most))
+    places = list(range(0, len(points), step))
+    if places and places[-1] != len(points) - 1:
+        places.append(len(points) - 1)
+    return [points[place] for place in places]
 
 
 def append(path: Path, row: dict[str, object]) -> None:

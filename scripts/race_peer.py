@@ -22,13 +22,12 @@ import shutil
 import signal
 import statistics
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from bench_peer import ROOT, make_player, their_command
-from learn_scene import append, read_rows
+from learn_scene import HERE, append, read_rows, thin
 
 from mappo_unity.runs.metrics_csv import read_metrics
 
@@ -85,7 +84,7 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
         "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
     }
     # whoever is interrupted plays on while it saves
-    for at_s, decisions, value in thin([point for point in points if point[0] <= limit_s]):
+    for at_s, decisions, value in thin([point for point in points if point[0] <= limit_s], POINTS):
         row = {"scene": scene, "who": who, "seed": seed, "second": round(at_s, 1), "decisions": decisions}
         append(RACE, row | {"return": f"{value:.4g}"} | facts)
     print(scene, who, seed, facts, points[-1:], flush=True)
@@ -94,8 +93,7 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
 def command_of(arguments: argparse.Namespace, scene: str, seed: int, who: str, folder: Path) -> list[Any]:
     """Return the command line of one of the three."""
     if who == PEER:
-        arguments.steps = official_steps(arguments.official, scene)
-        return their_command(arguments, scene, seed, make_player(scene, folder), folder)
+        return their_command(arguments, scene, seed, None, make_player(scene, folder), folder)
 
     lines = [f"env={scene}", f"seed={seed}", "num_threads=1", f"hydra.run.dir={folder / 'run'}"]
     if who == PLAYER:
@@ -106,16 +104,7 @@ def command_of(arguments: argparse.Namespace, scene: str, seed: int, who: str, f
             "env.no_graphics=true",
             "env.num_areas=null",
         ]
-    return [Path(sys.executable).parent / "mappo-train", *lines, "log.progress=false"]
-
-
-def official_steps(official: Path, scene: str) -> int:
-    """Return max_steps of the official configuration."""
-    import yaml
-
-    (path,) = official.glob(f"p*/{scene}.yaml")
-    behaviors = yaml.safe_load(path.read_text())["behaviors"]
-    return max(int(behavior["max_steps"]) for behavior in behaviors.values())
+    return [HERE / "mappo-train", *lines, "log.progress=false"]
 
 
 def run_for(command: list[Any], log: Path, limit_s: float) -> float:
@@ -162,12 +151,6 @@ def embedded_curve(folder: Path, start: float) -> list[tuple[float, int, float]]
     rows = [row for row in read_metrics(path) if row["episodes"] >= WINDOW]
     beside_s = path.stat().st_mtime - start - rows[-1]["wall_s"] if rows else 0.0
     return [(row["wall_s"] + beside_s, int(row["agent_steps"]), row["return_mean"]) for row in rows]
-
-
-def thin(points: list[tuple[float, int, float]]) -> list[tuple[float, int, float]]:
-    """Return every so-manieth point and the last one."""
-    step = -(-len(points) // POINTS) or 1
-    return [*points[::step], *points[-1:]] if (len(points) - 1) % step else points[::step]
 
 
 def write_page() -> None:

@@ -15,7 +15,6 @@ OPTIONs of mappo-train are noted with the run. The pictures need matplotlib.
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import signal
 import subprocess
@@ -23,7 +22,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from learn_scene import HERE, append, mappo_eval, read_rows
+from learn_scene import HERE, append, mappo_eval, read_rows, thin
 from score_measures import MEASURES, Measure, measures_of
 from score_page import CURVES, SCORES, write_page
 
@@ -198,8 +197,7 @@ def append_curve(measure: Measure, seed: int, metrics: list[dict[str, str]]) -> 
         for row in metrics
         if float(row["episodes"]) >= 100 and row.get(measure.column) and row[measure.column] != "nan"
     ]
-    step = max(1, math.ceil(len(known) / POINTS))
-    for row in [*known[::step], *known[-1:]]:
+    for row in thin(known, POINTS):
         point = {
             "scene": measure.scene,
             "column": measure.column,

@@ -126,7 +126,6 @@ FACTS: dict[str, Any] = {
     "same_for_all": False,
     "one_action": 0.0,
     "never_allowed": [],
-    "at_limits": None,
 }
 
 

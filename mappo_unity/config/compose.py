@@ -21,7 +21,7 @@ from mappo_unity.config import effects
 from mappo_unity.config.behavior_lines import OPEN
 from mappo_unity.config.extras import SWEEP_EXTRA
 from mappo_unity.config.option_table import option_table
-from mappo_unity.config.options_file import file_root
+from mappo_unity.config.options_file import file_root, read_yaml
 from mappo_unity.config.overrides import (
     add_plus_prefix,
     check_overrides,
@@ -227,11 +227,7 @@ def _named(value: Any) -> Any:
 
 
 def _read_options(path: Path) -> dict[Any, Any]:
-    try:
-        saved = OmegaConf.to_container(OmegaConf.load(path))
-    except Exception as error:
-        raise ConfigError(f"{path} cannot be read ({' '.join(str(error).split())})") from error
-
+    saved = read_yaml(path)
     if not isinstance(saved, dict) or not saved:
         raise ConfigError(f"{path} holds no options")
 

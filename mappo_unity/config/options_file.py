@@ -80,15 +80,23 @@ def file_root(path: Path, lines: list[str]) -> dict[Any, Any]:
     return {"defaults": entries, **root, **options}
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return a file's options, nested, and the presets that it chooses."""
+def read_yaml(path: Path, missing: str | None = None) -> Any:
+    """Return what a YAML file holds; raise ConfigError where it cannot be read.
+
+    Args:
+        missing: the message where there is no such file; None: as for any that cannot be read.
+    """
     try:
-        saved = OmegaConf.to_container(OmegaConf.load(path))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{_typed(path)}: there is no such file") from error
-    except Exception as error:
+        return OmegaConf.to_container(OmegaConf.load(path))
+    except Exception as error:  # whatever a damaged file makes YAML raise
+        if missing is not None and isinstance(error, FileNotFoundError):
+            raise ConfigError(missing) from error
         raise ConfigError(f"{path} cannot be read ({' '.join(str(error).split())})") from error
 
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return a file's options, nested, and the presets that it chooses."""
+    saved = read_yaml(path, missing=f"{_typed(path)}: there is no such file")
     if not isinstance(saved, dict) or not saved:
         raise ConfigError(
             f"{path} holds no options: it must be YAML such as a run's config.yaml, ppo: {{lr: 1e-4}}"

@@ -15,6 +15,10 @@ from mappo_unity.runs.metrics_csv import STEP
 
 _WIN_RATE = "win_rate_vs_random"
 _RISE = 5.0  # standard errors by which a return must have risen: many windows are compared
+_ONE_ACTION = 0.95  # of the decisions
+
+Facts = dict[str, Any]
+"""What the batches of one policy name held (`PolicySurvey.facts`)."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,10 @@ class Evidence:
 
     @cached_property
     def returns(self) -> tuple[float, float, float]:
-        """The mean return of the first full window, that of the last rows, and the error of a window."""
+        """The mean return of the first full window, that of the last rows, and by how much one must differ.
+
+        All are NaN before there are two full windows.
+        """
         value, spread = self.run.columns.get("return_mean"), self.run.columns.get("return_std")
         ended = self.run.columns.get("episodes")
         if value is None or spread is None or ended is None:
@@ -105,7 +112,7 @@ class Evidence:
         last = value[full][-max(1, int(full.sum()) // 5) :]
         # of the widest window: early ones may not have met a reward that later ones do by luck
         error = spread[full].max() / math.sqrt(window)
-        return float(value[full][0]), float(last.mean()), error
+        return float(value[full][0]), float(last.mean()), max(_RISE * float(error), 1e-6)
 
     @cached_property
     def has_risen(self) -> bool:
@@ -114,9 +121,8 @@ class Evidence:
         A run that began with a trained policy, that went on to another lesson, or that came to its goal, has
         nothing to show here.
         """
-        if self.option("init_from") not in ("", "null") or any(
-            key.endswith(".init_from") and value != "null" for key, value in self.run.options.items()
-        ):
+        begun_with = [v for key, v in self.run.options.items() if key.rpartition(".")[2] == "init_from"]
+        if any(value not in ("", "null") for value in begun_with):
             return True
         if any(np.ptp(self.column(name)) > 0 for name in self.run.metrics if name.startswith("lesson/")):
             return True
@@ -125,16 +131,19 @@ class Evidence:
         if len(won):
             return bool(won[-3:].mean() > 0.6)
 
-        first, last, error = self.returns
-        if math.isnan(first):
-            return False
-        return last - first > max(_RISE * error, 1e-6)
+        first, last, least = self.returns
+        return last - first > least
 
     @cached_property
     def has_fallen(self) -> bool:
         """Whether the return is below where it began."""
-        first, last, error = self.returns
-        return not math.isnan(first) and first - last > max(_RISE * error, 1e-6)
+        first, last, least = self.returns
+        return first - last > least
+
+
+def leaves_one_action(facts: Facts) -> bool:
+    """Return whether masks leave one action in nearly all decisions."""
+    return (facts.get("one_action") or 0.0) >= _ONE_ACTION
 
 
 def amount(value: float) -> str:

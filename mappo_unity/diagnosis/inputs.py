@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
-from mappo_unity.diagnosis.evidence import Evidence, Finding, amount
+from mappo_unity.diagnosis.evidence import Evidence, Facts, Finding, amount, leaves_one_action
 
 _HUGE = 100.0  # of an observation; networks are made for values of about 1
 _TINY = 1e-3
@@ -13,8 +12,6 @@ _HUGE_RETURN = 100.0  # of a reward, where values are not normalised
 _ENOUGH = 5_000  # decisions before anything is said about observations and masks
 _IDLE = 0.1  # of the agents: some of a team may be dead for long
 _SHOWN = 4  # elements that a finding names
-
-Facts = dict[str, Any]
 
 
 def from_inputs(evidence: Evidence) -> Iterator[Finding]:
@@ -114,7 +111,7 @@ def _scales(evidence: Evidence, name: str, facts: Facts) -> Iterator[Finding]:
 
 
 def _masks(name: str, facts: Facts) -> Iterator[Finding]:
-    if facts["one_action"] is not None and facts["one_action"] >= 0.95:
+    if leaves_one_action(facts):
         yield Finding(
             "one action",
             f"{name}: masks leave one action",

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mappo_unity.diagnosis.evidence import Evidence, Finding, amount
+from mappo_unity.diagnosis.evidence import Evidence, Finding, amount, leaves_one_action
 
 _COLLAPSED = 0.05  # of the largest entropy of discrete actions
 _COLLAPSED_NATS = -2.5  # of a continuous column: a standard deviation of 0.02, where 1 is an action's range
@@ -34,7 +34,7 @@ def from_learning(evidence: Evidence) -> Iterator[Finding]:
         facts = evidence.survey.get(name or "", {})
         # where there is no choice, there is nothing to learn; without rewards or steps, nothing to predict by
         stands = list(_steps(evidence, name))
-        if (facts.get("one_action") or 0.0) < 0.95:
+        if not leaves_one_action(facts):
             yield from stands
             yield from _entropy(evidence, name)
         if not stands and (not facts or facts["rewards"]["nonzero"]):

@@ -1,8 +1,8 @@
 """What a run's batches held: observations, masks, rewards, ends; counted while it trains, kept as JSON.
 
-Rewards and ends are counted in every batch. Observations, masks and actions are looked at in the first batch
-and then ever more rarely (the 2nd, 4th, 8th ...), in at most `ROWS` of its decisions: that costs nothing
-that a run would feel.
+Rewards and ends are counted in every batch. Observations and masks are looked at in the first batch and then
+ever more rarely (the 2nd, 4th, 8th ...), in at most `ROWS` of its decisions: that costs nothing that a run
+would feel.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ class PolicySurvey:
 
     def __init__(self, spec: BehaviorSpec) -> None:
         self._branches = list(spec.action_spec.discrete_branches)
-        self._continuous = spec.action_spec.continuous_size
         self._acted: np.ndarray | None = None  # rounds in which each slot's agent asked, and was there
         self._there: np.ndarray | None = None
         self._looks = 0
@@ -48,7 +47,7 @@ class PolicySurvey:
         vectors = [(s.name, s.shape[0]) for s in spec.observation_specs if len(s.shape) == 1]
         self.facts: dict[str, Any] = {
             "branches": self._branches,
-            "continuous": self._continuous,
+            "continuous": spec.action_spec.continuous_size,
             "vectors": vectors,
             "decisions": 0,
             "rewards": {"count": 0, "nonzero": 0, "at_ends": 0, "least": 0.0, "greatest": 0.0},
@@ -60,7 +59,6 @@ class PolicySurvey:
             "same_for_all": None,
             "one_action": None,
             "never_allowed": None,
-            "at_limits": None,
         }
 
     # --- in every batch
@@ -115,7 +113,7 @@ class PolicySurvey:
     # --- in some
 
     def look(self, rounds: TensorDictBase) -> None:
-        """Look at observations, masks and actions of a batch ``[T, ..., A]``."""
+        """Look at observations and masks of a batch ``[T, ..., A]``."""
         asked = rounds.get(keys.ACTING).squeeze(-1)
         places = asked.reshape(-1).nonzero().squeeze(-1)
         if not len(places):
@@ -135,8 +133,6 @@ class PolicySurvey:
             self._look_at_image(name, rows(name))
         if keys.MASK in names:
             self._look_at_masks(rows(keys.MASK).numpy())
-        if self._continuous:
-            self._look_at_actions(rows(keys.ACTION)[:, : self._continuous].float().abs().numpy())
 
     def _look_at_elements(self, values: np.ndarray) -> None:
         least, greatest = values.min(0), values.max(0)
@@ -182,28 +178,24 @@ class PolicySurvey:
         share = self.facts["one_action"] or 0.0
         self.facts["one_action"] = share + (float(one) - share) / self._looks
 
-    def _look_at_actions(self, size: np.ndarray) -> None:
-        # ML-Agents clips actions to +-3 and sends a third of them
-        self.facts["at_limits"] = float((size >= 2.94).mean())
-
 
 class Survey:
     """What a run's batches held, policy by policy.
 
     Args:
-        specs: of each policy name.
-        sides: behaviors of each policy name.
+        specs: of each behavior.
+        sides: behaviors of each policy name, which are alike.
     """
 
     def __init__(self, specs: Mapping[str, BehaviorSpec], sides: Mapping[str, Sequence[str]]) -> None:
-        self._policies = {name: PolicySurvey(spec) for name, spec in specs.items()}
+        self._policies = {name: PolicySurvey(specs[behaviors[0]]) for name, behaviors in sides.items()}
         self._sides = sides
         self._batches = 0
 
     def add(self, rounds: TensorDictBase, episodes: Mapping[str, Sequence[Episode]]) -> bool:
         """Take a batch ``[T]`` in, as learners get it; return whether it was looked at closely."""
         self._batches += 1
-        is_closer = self._batches & (self._batches - 1) == 0
+        is_closer = self._batches.bit_count() == 1
 
         for name, policy in self._policies.items():
             policy.count(rounds.get(name), rounds.get(("next", name)))

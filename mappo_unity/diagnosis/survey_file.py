@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.json_record import read_json
 
 FILE = "survey.json"
 
@@ -18,8 +19,4 @@ def write_survey(folder: Path, facts: dict[str, Any]) -> None:
 
 def read_survey(folder: Path) -> dict[str, Any]:
     """Return what it says by policy name; nothing where it is missing or damaged."""
-    try:
-        found = json.loads((folder / FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
+    return read_json(folder / FILE)

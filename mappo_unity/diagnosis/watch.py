@@ -22,7 +22,7 @@ class Watch:
 
     Args:
         folder: the run's.
-        specs: of each policy name.
+        specs: of each behavior.
         sides: behaviors of each policy name.
     """
 

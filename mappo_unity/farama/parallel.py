@@ -12,6 +12,7 @@ from pettingzoo import ParallelEnv
 from mappo_unity.errors import ConfigError
 from mappo_unity.farama.session import Session
 from mappo_unity.farama.spaces import BehaviorSpaces
+from mappo_unity.keys import policy_name
 
 Result = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict]]
 
@@ -214,7 +215,7 @@ class _Tick:
 
 def _labels(behaviors: list[str]) -> dict[str, str]:
     """Return what each behavior's agents are called: its policy's name, with the side if it has several."""
-    policies = [behavior.partition("?team=")[0] for behavior in behaviors]
+    policies = [policy_name(behavior) for behavior in behaviors]
     return {
         behavior: f"{policy}_team{behavior.partition('?team=')[2]}" if policies.count(policy) > 1 else policy
         for behavior, policy in zip(behaviors, policies)

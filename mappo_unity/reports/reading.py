@@ -5,7 +5,6 @@ It only reads, runs that are being trained too, and runs of older versions as th
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +16,12 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from mappo_unity.config.option_table import find_option, option_table, show_value
+from mappo_unity.config.options_file import read_yaml
 from mappo_unity.config.renamed import rename_keys
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.folder import CONFIG, OVERRIDES, VERSIONS, check_there, find_run, runs_below
+from mappo_unity.runs.json_record import read_json
 from mappo_unity.runs.metrics_csv import STEP, read_metrics
 
 METRICS = "metrics.csv"
@@ -98,9 +99,9 @@ def read_run(folder: Path) -> Run:
         folder,
         _options(folder / CONFIG),
         _columns(folder / METRICS),
-        _json(folder / VERSIONS),
+        read_json(folder / VERSIONS),
         _starts(folder / OVERRIDES),
-        _json(folder / RESULT),
+        read_json(folder / RESULT),
     )
 
 
@@ -126,10 +127,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def _options(path: Path) -> dict[str, str]:
-    try:
-        saved = OmegaConf.to_container(OmegaConf.load(path))
-    except Exception as error:
-        raise ConfigError(f"{path} cannot be read ({' '.join(str(error).split())})") from error
+    saved = read_yaml(path)
     if not isinstance(saved, dict):
         raise ConfigError(f"{path} holds no options")
 
@@ -148,15 +146,6 @@ def _flat(value: dict[Any, Any], prefix: str) -> dict[str, str]:
         else:
             flat[key] = show_value(item)
     return flat
-
-
-def _json(path: Path) -> dict[str, Any]:
-    """Return what a file of the record holds; nothing where it is missing or damaged: runs show without."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _starts(path: Path) -> list[dict[str, Any]]:

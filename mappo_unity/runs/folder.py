@@ -26,6 +26,7 @@ from mappo_unity.config.schema import Config
 from mappo_unity.config.user_modules import folder_of
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.json_record import read_json
 from mappo_unity.runs.lock import LOCK
 
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
@@ -208,10 +209,7 @@ def check_there(path: Path, option: str, wanted: str = "") -> None:
 
 def factory_folder(folder: Path) -> Path | None:
     """Return the folder in which a run found the module of env.factory; None: its record does not say."""
-    try:
-        found = json.loads((folder / VERSIONS).read_text(encoding="utf-8")).get(FACTORY_FOLDER)
-    except (OSError, ValueError, AttributeError):
-        return None
+    found = read_json(folder / VERSIONS).get(FACTORY_FOLDER)
     return Path(found) if isinstance(found, str) and found else None
 
 

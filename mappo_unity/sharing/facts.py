@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -22,6 +21,7 @@ from mappo_unity.policies.onnx_policy import OnnxPolicy
 from mappo_unity.policies.policy_files import RANDOM
 from mappo_unity.runs import checkpoint as checkpoints
 from mappo_unity.runs.folder import CONFIG, VERSIONS, find_run
+from mappo_unity.runs.json_record import read_json
 from mappo_unity.runs.metrics_csv import STEP, read_metrics
 from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes import scene_names
@@ -71,20 +71,15 @@ def gather(
 
     facts = []
     for name, layout in trained.state["layout"].items():
-        branches = layout["branches"]
-        seen = [spec for behavior, spec in specs.items() if keys.policy_name(behavior) == name]
-        names = (
-            [sensor.name for sensor in seen[0].observation_specs]
-            if seen
-            else [f"obs_{i}" for i in range(len(layout["sensors"]))]
-        )
+        branches, sensors = layout["branches"], layout["sensors"]
+
         facts.append(
             Facts(
                 policy=name,
                 file=files[name].name,
                 env=trained.state["env_name"],
                 agent_steps=trained.state["agent_steps"],
-                sensors=list(zip(names, layout["sensors"])),
+                sensors=list(zip(_sensor_names(specs, name, len(sensors)), sensors)),
                 continuous=layout["continuous"],
                 discrete=f"branches of {', '.join(map(str, branches))}" if branches else "",
                 team_size=layout["team_size"],
@@ -140,6 +135,14 @@ def _specs(trained: Trained, episodes: int | None) -> Mapping[str, Any]:
         return dict(base_env.behavior_specs)
     finally:
         base_env.close()
+
+
+def _sensor_names(specs: Mapping[str, Any], policy: str, count: int) -> list[str]:
+    """Return the names of a policy's sensors; numbers where its environment was not opened."""
+    for behavior, spec in specs.items():
+        if keys.policy_name(behavior) == policy:
+            return [sensor.name for sensor in spec.observation_specs]
+    return [f"obs_{i}" for i in range(count)]
 
 
 def _measured(trained: Trained, episodes: int, behaviors: Iterable[str]) -> dict[str, Earned | Won]:
@@ -198,9 +201,7 @@ def _training(trained: Trained, config: Config | None) -> Training | None:
     if trained.run is None or config is None:
         return None
 
-    versions: dict[str, Any] = {}
-    with suppress(OSError, ValueError):
-        versions = json.loads((trained.run / VERSIONS).read_text(encoding="utf-8"))
+    versions = read_json(trained.run / VERSIONS)
     return Training(
         command=train_line(config),
         seed=config.seed,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from operator import attrgetter
 from typing import Any
 
 from mappo_unity.config.behavior_lines import OPEN
@@ -27,7 +28,7 @@ def train_line(config: Config) -> str:
     fallback = "custom" if config.env.factory is not None else "unity"
     preset = config.env.name if config.env.name in choices else fallback
 
-    source = {key: _value(config, key) for key in _SOURCE}
+    source = {key: attrgetter(key)(config) for key in _SOURCE}
     given = [_line(key, value) for key, value in source.items() if value is not None]
     base = compose_config([f"env={quoted_path(preset)}", *given]).config
 
@@ -38,19 +39,12 @@ def train_line(config: Config) -> str:
     for key, option in option_table(Config).items():
         if option.is_section or key in (*_PLACE, *_SOURCE) or key.startswith("log."):
             continue
-        value, usual = _value(config, key), _value(base, key)
+        value, usual = attrgetter(key)(config), attrgetter(key)(base)
         if key in OPEN:
             words += [_word(name, item) for name, item in _changes(key, usual, value)]
         elif value != usual:
             words.append(_word(key, value))
     return " ".join(["mappo-train", *words])
-
-
-def _value(config: Config, key: str) -> Any:
-    value: Any = config
-    for part in key.split("."):
-        value = getattr(value, part)
-    return value
 
 
 def _changes(key: str, usual: dict[str, Any], value: dict[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -78,7 +78,7 @@ def train(
             exports = RunExports(folder, log.message) if cfg.export_onnx else None
             saver = CheckpointSaver(cfg, folder, state, exports, resume_from)
             stop = StopSignals(log.message)
-            specs = {name: setup.env.behaviors[sides[0]].spec for name, sides in setup.env.sides.items()}
+            specs = {name: behavior.spec for name, behavior in setup.env.behaviors.items()}
             watch = Watch(folder, specs, setup.env.sides)
 
             with setup.collecting() as batches, stop.taken():
@@ -164,7 +164,7 @@ def _status(cfg: Config, state: RunState, stop: StopSignals) -> str | None:
 def _warn_rollback(name: str, metrics: dict[str, float], state: RunState, log: RunLog) -> None:
     """Say it when a policy's update was rolled back, for the first time, the 2nd, 4th, 8th ..."""
     rolled_back, updates = state.updates[name]
-    is_power_of_two = rolled_back & (rolled_back - 1) == 0
+    is_power_of_two = rolled_back.bit_count() == 1
     if metrics.get("rolled_back") and is_power_of_two:
         limit = state.setup.learners[name].cfg.max_kl
         log.message(

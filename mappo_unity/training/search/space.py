@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from mappo_unity.config.option_table import did_you_mean, find_option, option_table, show_value, without_none
+from mappo_unity.config.options_file import read_yaml
 from mappo_unity.config.overrides import check_value
 from mappo_unity.config.presets import conf_dir, group_choices
 from mappo_unity.config.schema import Config
@@ -90,13 +89,7 @@ def read_space(name: str) -> Space:
             )
         path = conf_dir() / "search" / f"{name}.yaml"
 
-    try:
-        raw = OmegaConf.to_container(OmegaConf.load(path))
-    except FileNotFoundError as error:
-        raise ConfigError(f"search={name}: there is no such file") from error
-    except Exception as error:
-        raise ConfigError(f"{path} cannot be read ({' '.join(str(error).split())})") from error
-
+    raw = read_yaml(path, missing=f"search={name}: there is no such file")
     if not isinstance(raw, dict) or not raw:
         raise ConfigError(f"{path} holds no options to search, such as ppo.epochs: {{low: 2, high: 8}}")
     try:
