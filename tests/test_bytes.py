@@ -20,6 +20,7 @@ from mlagents_envs.base_env import (
 from mappo_unity.config.compose import compose_config
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout, in_floats
+from mappo_unity.learning.networks.images import by_pixel
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.contract.images import ByteImage, from_bytes, to_bytes
 from mappo_unity.scenes.contract.rules import EnvironmentDataError
@@ -112,4 +113,28 @@ def test_a_scene_s_grids_train_as_floats_do(tmp_path: Path, monkeypatch: pytest.
             torch.load(outcome.last_checkpoint, weights_only=True)["learners"]["GridFoodCollector"]["actor"]
         )
     for key, value in weights[0].items():
-        assert torch.equal(value, weights[1][key]), key
+        # bytes lie in memory pixel by pixel, floats channel by channel: sums have another order
+        torch.testing.assert_close(value, weights[1][key], rtol=1e-4, atol=1e-5, msg=key)
+
+
+def test_minibatches_of_grids_lie_pixel_by_pixel_in_memory(tmp_path: Path) -> None:
+    with set_up(compose_config(GRIDS).config, tmp_path) as setup, setup.collecting() as batches:
+        rounds, following = next(batches).of("GridFoodCollector")
+        (learner,) = setup.learners.values()
+        buffer, _ = learner.prepare(rounds, following)
+        assert buffer is not None
+
+        for _ in range(2):  # of the first batch, and of one with carried rounds
+            (minibatch,) = buffer
+            grids = minibatch.get("obs_0")
+            assert grids.shape[-3:] == (5, 40, 40) and grids.stride()[-3:] == (1, 200, 5)
+            buffer, _ = learner.prepare(rounds, following)
+
+        assert rounds.get("obs_0").stride()[-3:] == (1600, 40, 1)  # the batch itself stays as it was
+
+
+def test_images_by_pixel_hold_the_same() -> None:
+    images = torch.randint(0, 256, (7, 2, 3, 4, 5), dtype=torch.uint8)
+    assert torch.equal(by_pixel(images), images)
+    assert by_pixel(images).stride() == (120, 60, 1, 15, 3)
+    assert by_pixel(images.float()).stride() == images.stride()  # floats stay where they are

@@ -7,6 +7,8 @@ has arrived since; a round in which nobody is pending any more is dropped, so th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,6 +17,7 @@ from torch import Tensor
 from mappo_unity import keys
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.networks.encoders import in_type
+from mappo_unity.learning.networks.images import by_pixel
 
 VALUED = "valued"  # bool [..., A, 1]: the row has a value, see `DecisionView`
 _SUMS = (keys.REWARD, keys.GROUP_REWARD)
@@ -34,10 +37,11 @@ class CarriedRounds:
         row_keys: entries that the networks read or wrote.
         shares_rewards: every member earns the sum of its team's individual rewards, as in MA-POCA, whose
             value is the whole team's.
+        images: those of `row_keys` that are images ``[..., C, H, W]``.
     """
 
-    def __init__(self, row_keys: list[str], shares_rewards: bool = False) -> None:
-        self._row_keys, self._shares_rewards = row_keys, shares_rewards
+    def __init__(self, row_keys: list[str], shares_rewards: bool = False, images: Sequence[str] = ()) -> None:
+        self._row_keys, self._shares_rewards, self._images = row_keys, shares_rewards, images
         self.rounds: TensorDict | None = None  # [P, ..., A]
 
     def join(self, batch: TensorDictBase) -> TensorDict:
@@ -47,6 +51,7 @@ class CarriedRounds:
         """
         following = batch.get("next")
         entries = {key: batch.get(key) for key in self._row_keys}
+        entries |= {key: by_pixel(entries[key]) for key in self._images}
         entries |= {keys.ACTING: batch.get(keys.ACTING), VALUED: has_value(batch)}
         entries |= {key: following.get(key) for key in (*_SUMS, *_ENDS)}
         if self._shares_rewards:

@@ -189,7 +189,8 @@ class Encoder(nn.Module):
         kind: the encoder of images.
         width: features of an image where ML-Agents' encoders encode it: those of the first hidden layer.
 
-    Attributes: `size`, F; `goal_columns`, those of the F that are goal signals.
+    Attributes: `size`, F; `goal_columns`, those of the F that are goal signals; `channels_first`, the entries
+    that are images ``[..., C, H, W]``.
     """
 
     def __init__(
@@ -204,6 +205,7 @@ class Encoder(nn.Module):
         dims = layout.channel_dims or (FIRST,) * len(layout.images)
         images = [ImageEncoder(s, dim, kind, width) for (_, s), dim in zip(layout.images, dims)]
         self.images = nn.ModuleList(images)
+        self.channels_first = [key for (key, _), dim in zip(layout.images, dims) if dim == FIRST]
         self.vector, self.has_vector = layout.vector, layout.vector > 0
 
         widths = [(key, net.size) for (key, _), net in zip(layout.images, images)]
@@ -226,6 +228,12 @@ class Encoder(nn.Module):
             around = torch.cat(parts, -1) if parts else None
             parts.append(self.sets(around, obs[behind:]))
         return torch.cat(parts, -1)
+
+
+def channels_first(net: nn.Module) -> list[str]:
+    """Return the entries that a network reads as images ``[..., C, H, W]``."""
+    encoders = (module for module in net.modules() if isinstance(module, Encoder))
+    return next((encoder.channels_first for encoder in encoders), [])
 
 
 def in_floats(image: Tensor) -> Tensor:

@@ -68,6 +68,17 @@ class ImageEncoder(nn.Module):
         return self.out(self.conv(flat)).unflatten(0, image.shape[:-3])
 
 
+def by_pixel(images: Tensor) -> Tensor:
+    """Return images ``[..., C, H, W]`` whose channels, pixel by pixel, lie side by side in memory.
+
+    Nothing else changes. On a CPU, gradients of convolutions of such images take half the time ("channels
+    last" in PyTorch). Bytes only: a second copy of images in floats would take four times as much memory.
+    """
+    if images.dtype != torch.uint8 or images.device.type != "cpu":
+        return images
+    return images.movedim(-3, -1).contiguous().movedim(-1, -3)
+
+
 class ResidualBlock(nn.Module):
     """Two convolutions whose output is added to what they were given."""
 
