@@ -8,7 +8,7 @@ from mlagents_envs.base_env import ActionSpec, BaseEnv, DecisionSteps, TerminalS
 
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.errors import ConfigError
-from mappo_unity.policies.matches import Score, count, find_sides, play_matches, wilson
+from mappo_unity.policies.matches import Score, count, find_sides, play_matches, points, wilson
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.scenes import make_scene
 
@@ -69,6 +69,38 @@ def test_the_better_player_wins_from_both_sides():
     scores = play_matches(Duel, Always(0), Always(1), 9, seed=0)
     assert [s.losses for s in scores.values()] == [5, 4]
     assert all(s.draws == s.matches for s in play_matches(Duel, Always(1), Always(1), 4, seed=0).values())
+
+
+def of(*played):
+    """Return the score of matches, each a result and its decisions."""
+    return sum((Score(r > 0, r == 0, r < 0, d, ((r, d),)) for r, d in played), Score())
+
+
+@pytest.mark.parametrize(
+    "striker, goalie, wanted",
+    [
+        ([(1, 30), (1, 40)], [(-1, 50), (-1, 39)], (2, 2)),  # sooner in one pair, later in the other
+        ([(1, 30), (1, 40)], [(-1, 50), (-1, 60)], (4, 0)),  # scored sooner than it was scored against
+        ([(1, 30), (1, 40)], [(-1, 30), (-1, 20)], (1, 3)),  # as fast in one pair, slower in the other
+        ([(-1, 90), (-1, 90)], [(1, 80), (1, 95)], (2, 2)),  # goalies win: again the sooner the better
+        ([(1, 30), (0, 99)], [(0, 99), (-1, 50)], (2, 2)),  # draws are halves, however long
+        ([(1, 30), (1, 30)], [(1, 50), (-1, 50)], (4, 0)),  # won as either side; and sooner
+        ([(1, 30), (1, 30)], [(-1, 50)], (3, 0)),  # the last match has no other to be compared with
+    ],
+)
+def test_where_one_side_always_wins_time_tells(striker, goalie, wanted):
+    sides = {"Striker?team=0": of(*striker), "Goalie?team=1": of(*goalie)}
+    assert points(sides) == wanted
+
+
+def test_where_both_sides_play_alike_results_tell():
+    sides = {"Duel?team=0": of((1, 30), (1, 40)), "Duel?team=1": of((-1, 50), (0, 60))}
+    assert points(sides) == (2.5, 1.5)
+
+
+def test_matches_that_are_played_tell_their_results_and_decisions():
+    scores = play_matches(Duel, Always(1), Always(0), 6, seed=0)
+    assert [s.played for s in scores.values()] == [((1, 1),) * 3] * 2
 
 
 def test_figures_and_the_interval_of_wilson():

@@ -9,13 +9,16 @@ groups) is positive at its end has won, one with a negative one has lost; anythi
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
 from mappo_unity.envs.backends import MakeEnv
 from mappo_unity.envs.rounds import Episode
+from mappo_unity.keys import policy_name
 from mappo_unity.policies.episodes import play
 from mappo_unity.policies.layouts import check_two_sides
 from mappo_unity.policies.policy import Policy
@@ -31,6 +34,7 @@ class Score:
     draws: int = 0
     losses: int = 0
     decisions: int = 0  # over all matches
+    played: tuple[tuple[int, int], ...] = ()  # of each match 1, 0 or -1, and decisions
 
     def __add__(self, other: Score) -> Score:
         return Score(
@@ -38,6 +42,7 @@ class Score:
             self.draws + other.draws,
             self.losses + other.losses,
             self.decisions + other.decisions,
+            self.played + other.played,
         )
 
     @property
@@ -134,10 +139,36 @@ def count(episodes: list[Episode], grouped: bool) -> Score:
                 continue
             seen.add(match)
 
-        result = episode.group_return if grouped else episode.individual_return
-        score += Score(int(result > 0), int(result == 0), int(result < 0), episode.length)
+        outcome = episode.group_return if grouped else episode.individual_return
+        result = int(outcome > 0) - int(outcome < 0)
+        length = episode.length
+        score += Score(int(result > 0), int(result == 0), int(result < 0), length, ((result, length),))
 
     return score
+
+
+def points(sides: Mapping[str, Score]) -> tuple[float, float]:
+    """Return points won and lost as both sides: a win counts 1, a draw 1/2.
+
+    Where the sides have different parts, a striker's and a goalie's, one of them may win always, whoever
+    plays it: results alone then call all policies equal. There the matches make pairs, one as each side, and
+    a pair that the same side has won twice goes to the policy that won sooner, or was beaten later.
+
+    Args:
+        sides: scores under the names of the sides' behaviors, as `play_matches` returns them.
+    """
+    total = sum(sides.values(), Score())
+    won, lost = total.wins + 0.5 * total.draws, total.losses + 0.5 * total.draws
+
+    parts = [{policy_name(behavior) for behavior in side.split("+")} for side in sides]
+    if len(parts) == 2 and parts[0] != parts[1]:
+        first, second = sides.values()
+        for (result, decisions), (other_result, other_decisions) in zip(first.played, second.played):
+            if result * other_result == -1:
+                # whoever wins takes the time that is shorter; what each won and lost there cancels out
+                sooner = result * int(np.sign(other_decisions - decisions))
+                won, lost = won + sooner, lost - sooner
+    return won, lost
 
 
 def wilson(wins: float, total: int) -> tuple[float, float]:

@@ -27,7 +27,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.policies.layouts import sides_of
 from mappo_unity.policies.league.growing import GrowingLeague, Points, step_name
-from mappo_unity.policies.matches import Z95, Score, play_matches
+from mappo_unity.policies.matches import Z95, Score, play_matches, points
 from mappo_unity.policies.policy import ActorPolicy, Policy, RandomPolicy
 from mappo_unity.policies.policy_files import RANDOM
 from mappo_unity.runs.folder import PLAYERS
@@ -93,14 +93,15 @@ class MatchSeries:
         others = {other: rival for other, rival in (opponents or {}).items() if other not in (name, RANDOM)}
         chosen = self.league.choose_opponents(others, self._cfg.matches.opponents)
         policy = ActorPolicy(layout, actors, False, "the policy")
-        scores = self._meet(env, agent_steps, policy, {name: others[name] for name in chosen})
+        met = self._meet(env, agent_steps, policy, {name: others[name] for name in chosen})
+        scores = {name: sum(sides.values(), Score()) for name, sides in met.items()}
 
         if self._interval_is_over(agent_steps):  # the last series leaves the rhythm of a longer run alone
             self._played_at = agent_steps
 
-        total = scores[RANDOM]
-        self.pool = [*self.pool, (total.wins + 0.5 * total.draws, total.matches)][-POOLED:]
-        rating = self.league.enter(name, self._results(scores), kept=others)
+        total, results = scores[RANDOM], {name: points(sides) for name, sides in met.items()}
+        self.pool = [*self.pool, (results[RANDOM][0], total.matches)][-POOLED:]
+        rating = self.league.enter(name, self._pooled(results), kept=others)
         self.said = f"{agent_steps:,} steps: of {total.matches} matches against a random side {_words(total)}"
         self.said += "".join(f"; against {other}: {_words(scores[other])}" for other in chosen)
         self.said += f"; rating {rating.rating:,.0f} ({rating.low:,.0f} to {rating.high:,.0f})"
@@ -156,8 +157,8 @@ class MatchSeries:
 
     def _meet(
         self, env: EnvConfig, agent_steps: int, policy: Policy, opponents: dict[str, Policy]
-    ) -> dict[str, Score]:
-        """Return the policy's scores against random and each opponent, over both sides."""
+    ) -> dict[str, dict[str, Score]]:
+        """Return the policy's scores against random and each opponent, as each side."""
         cfg = self._cfg
         # `torch.manual_seed` seeds the GPU, too, where the policy draws its actions
         cuda = [torch.device(cfg.device)] if cfg.device.startswith("cuda") else []
@@ -167,25 +168,21 @@ class MatchSeries:
             make_env = make_env_function(env, self._folder / PLAYERS / "matches")
             seed = (cfg.seed + agent_steps) % 2**31
 
-            totals = {}
+            scores = {}
             everybody: dict[str, Policy] = {RANDOM: RandomPolicy(seed), **opponents}
             for index, (name, other) in enumerate(everybody.items()):
                 # matches that begin alike would be lucky alike
-                sides = play_matches(make_env, policy, other, cfg.matches.count, (seed + index) % 2**31)
-                totals[name] = sum(sides.values(), Score())
+                seed_of_other = (seed + index) % 2**31
+                scores[name] = play_matches(make_env, policy, other, cfg.matches.count, seed_of_other)
 
-        return totals
+        return scores
 
-    def _results(self, scores: dict[str, Score]) -> dict[str, Points]:
+    def _pooled(self, results: dict[str, Points]) -> dict[str, Points]:
         """Return the points won and lost that the policy's rating is taken from, by opponent."""
-        results = {
-            name: (score.wins + 0.5 * score.draws, score.losses + 0.5 * score.draws)
-            for name, score in scores.items()
-        }
-        if len(scores) == 1:  # random alone
-            points, matches = (sum(column) for column in zip(*self.pool, strict=True))
-            results[RANDOM] = (points, matches - points)
-        return results
+        if len(results) > 1:
+            return results
+        won, matches = (sum(column) for column in zip(*self.pool, strict=True))  # random alone
+        return {RANDOM: (won, matches - won)}
 
     def _interval_is_over(self, agent_steps: int) -> bool:
         interval = self._cfg.matches.interval
