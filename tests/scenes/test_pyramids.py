@@ -12,7 +12,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.scenes.pyramids.bodies import contact_point
-from mappo_unity.scenes.pyramids.bricks import ABSENT, ASLEEP, AWAKE, FALLING
+from mappo_unity.scenes.pyramids.bricks import ABSENT, ASLEEP, AWAKE, CALM_SUBSTEPS, FALLING, SUBSTEPS
 from mappo_unity.scenes.pyramids.layout import ZONES
 from mappo_unity.scenes.pyramids.scene import Pyramids
 
@@ -332,6 +332,38 @@ def test_ramming_topples_the_pile_and_slows_the_agent() -> None:
     env.bodies.position[0] = (-40.0, 0.5, 0.0)
     play(env, NONE, 60)
     assert env.bricks.mode.tolist() == [ASLEEP]
+
+
+@pytest.mark.parametrize(
+    "brick, agent, where, steps",
+    [
+        (15.9, 0.0, 0.0, [CALM_SUBSTEPS]),
+        (16.1, 0.0, 0.0, [SUBSTEPS]),  # a fast brick
+        (0.0, 15.9, 0.0, [CALM_SUBSTEPS]),
+        (0.0, 16.1, 0.0, [SUBSTEPS]),  # a fast agent in the pile
+        (0.0, 40.0, 20.0, [CALM_SUBSTEPS]),  # one that is far from it
+    ],
+)
+def test_a_calm_pile_takes_longer_steps(
+    brick: float, agent: float, where: float, steps: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = pyramids()
+    env.bricks.appear(AREA, np.zeros((1, 2)))
+    env.bricks.mode[:] = AWAKE
+    env.bricks.bodies[0, :, 1] += 10.0  # in the air, where they do not touch the agent
+    env.bricks._speeds[0, 0, 0] = brick
+    position = np.array([[where, 12.0 if where == 0.0 else 0.5, 0.0]])
+
+    taken = []
+    step = env.bricks._physics.step
+    monkeypatch.setattr(
+        env.bricks._physics,
+        "step",
+        lambda count, areas, dt: (taken.append((count, dt)), step(count, areas, dt)),
+    )
+    switch = np.zeros((1, 3)), np.zeros(1)
+    env.bricks.step(position, np.array([[agent, 0.0, 0.0]]), np.zeros(1), switch)
+    assert taken == [(count, pytest.approx(0.02 / count)) for count in steps]
 
 
 def test_sleeping_piles_do_not_move_and_a_pile_in_a_wall_is_not_replayed() -> None:

@@ -52,6 +52,7 @@ class AreaPhysics:
         shared = self.model if self._per_model == 1 else _repeated(area, self.model, self._per_model)
         self._models = [shared] * num_models
         self._shared = shared
+        self._by_timestep = {shared.opt.timestep: shared}
 
         self._data = [mujoco.MjData(shared) for _ in range(num_threads)]
         self._scratch = mujoco.MjData(shared)
@@ -59,15 +60,22 @@ class AreaPhysics:
         self._num_areas = num_areas
         self._allocate()
 
-    def step(self, num_substeps: int = 1, areas: np.ndarray | None = None) -> None:
+    def step(
+        self, num_substeps: int = 1, areas: np.ndarray | None = None, timestep: float | None = None
+    ) -> None:
         """Advance areas by `num_substeps` MuJoCo steps with constant inputs.
 
-        `areas`: integers [n] of those that move, the others sleep (with one area a model only); None: all.
-        Raises FloatingPointError: an area's state has become infinite or NaN (names the first).
+        Args:
+            num_substeps: how many.
+            areas: integers [n] of those that move, the others sleep (with one area a model only); None: all.
+            timestep: s, of these steps, for areas without constants of their own; None: the model's.
+
+        Raises:
+            FloatingPointError: an area's state has become infinite or NaN (names the first).
         """
         assert areas is None or self._per_model == 1, "areas that share a model step together"
         rows: slice | np.ndarray = slice(None) if areas is None else areas
-        models = self._models if areas is None else [self._models[area] for area in areas.tolist()]
+        models = self._chosen(areas, timestep)
         num_models, per_area = len(models), (len(models) * self._per_model, -1)
 
         # Positions, velocities and inputs into MuJoCo's own rows: clock, positions, velocities, the rest.
@@ -132,7 +140,7 @@ class AreaPhysics:
 
     def set_gravity(self, gravity: float) -> None:
         """Set the downward (-y) acceleration of all areas, m/s^2."""
-        for model in {id(m): m for m in (*self._models, self._shared)}.values():
+        for model in {id(m): m for m in (*self._models, *self._by_timestep.values())}.values():
             model.opt.gravity[:] = (0.0, -gravity, 0.0)
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -145,6 +153,15 @@ class AreaPhysics:
         arrays = {"qpos": self._qpos, "qvel": self._qvel, "sensordata": self._sensordata, "rest": self._state}
         for name, array in {**arrays, **self._input_arrays}.items():
             array[...] = state[name]
+
+    def _chosen(self, areas: np.ndarray | None, timestep: float | None) -> list[mujoco.MjModel]:
+        """Return the models of areas (None: of all), or the common one with another timestep."""
+        if timestep is None:
+            return self._models if areas is None else [self._models[area] for area in areas.tolist()]
+        if timestep not in self._by_timestep:
+            model = self._by_timestep[timestep] = copy.copy(self._shared)
+            model.opt.timestep = timestep
+        return [self._by_timestep[timestep]] * len(self._models if areas is None else areas)
 
     def _allocate(self) -> None:
         """Create the arrays by area; idle areas of the last model stand at the end, out of sight."""

@@ -12,23 +12,17 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mappo_unity.scenes.core.ground import CONTACT_GAP, TICK_S
 from mappo_unity.scenes.core.physics import AreaPhysics
-from mappo_unity.scenes.pyramids.layout import (
-    BRICKS,
-    GOAL,
-    INNER_WALLS,
-    INSIDE_X,
-    INSIDE_Z,
-    SPAWN_Y,
-    STONE_LAYERS,
-)
+from mappo_unity.scenes.pyramids.area import area_spec
+from mappo_unity.scenes.pyramids.layout import BRICKS, GOAL, INNER_WALLS, SPAWN_Y
 
 NUM_BODIES = len(BRICKS) + 1
 SUBSTEPS = 10  # of 2 ms in a tick: agents hit the cubes at up to 40 m/s
+CALM_SUBSTEPS = 5  # of 4 ms, while nothing in a pile, nor the agent beside it, is faster than
+CALM_SPEED = 16.0  # m/s: 6.4 cm a substep, less than the 8 cm of 40 m/s
 ABSENT, FALLING, ASLEEP, AWAKE = range(4)
 HALVES = np.array([[0.5] * 3] * len(BRICKS) + [[1.0] * 3])
 RADII = np.sqrt((HALVES**2).sum(axis=1))
@@ -40,8 +34,6 @@ MAX_SPIN = 7.0  # rad/s: the engine's limit
 SPIN_KEPT = 1.0 - 0.05 * TICK_S
 FALL_TICKS = 150  # of the recording; the pile is at rest after about 100
 MARGIN = 0.1  # m
-# without islands it stops when the pile as a whole has settled: a fifth less work than by MuJoCo's default
-_SOLVER = 'solver="Newton" cone="pyramidal" jacobian="sparse" tolerance="1e-4"'
 _AGENT_JOINTS = 3  # along x and z, about y
 
 
@@ -53,7 +45,7 @@ class PyramidsBricks:
     """
 
     def __init__(self, num_areas: int, num_threads: int = 1) -> None:
-        self._physics = AreaPhysics(_area_spec(), num_areas, num_threads=num_threads)
+        self._physics = AreaPhysics(area_spec(SUBSTEPS), num_areas, num_threads=num_threads)
         start = _AGENT_JOINTS
         self.bodies = self._physics.qpos[:, start:].reshape(num_areas, NUM_BODIES, 7)  # x y z, w x y z
         self._speeds = self._physics.qvel[:, start:].reshape(num_areas, NUM_BODIES, 6)
@@ -65,7 +57,7 @@ class PyramidsBricks:
     @cached_property
     def _fall(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the recording of a fall at the origin: poses [T, B, 7] and velocities [T, B, 6]."""
-        alone = AreaPhysics(_area_spec(), 1)
+        alone = AreaPhysics(area_spec(SUBSTEPS), 1)
         poses, speeds = [], []
         alone.qpos[0, :2] = 40.0  # the agent, far away
         alone.qpos[0, _AGENT_JOINTS:] = _spawned().ravel()
@@ -144,14 +136,16 @@ class PyramidsBricks:
         physics.mocap_quat[areas, 0, 2] = np.sin(0.5 * switch[1][areas])
 
         self._limit_spin(areas)
-        physics.step(SUBSTEPS, areas)
+        calm = self._calm(areas, position, velocity)
+        for some, substeps in ((areas[calm], CALM_SUBSTEPS), (areas[~calm], SUBSTEPS)):
+            if some.size:
+                physics.step(substeps, some, TICK_S / substeps)
+                # the goal may be thrown clear in the tick
+                goal[some] = physics.substep_sensors()[:, :, 0].min(axis=1) < CONTACT_GAP
 
         # the pile may have slowed the agents down
         position[areas, 0], position[areas, 2] = physics.qpos[areas, 0], physics.qpos[areas, 1]
         velocity[areas, 0], velocity[areas, 2] = physics.qvel[areas, 0], physics.qvel[areas, 1]
-
-        distance = physics.substep_sensors()[:, :, 0].min(axis=1)  # the goal may be thrown clear in the tick
-        goal[areas] = distance < CONTACT_GAP
 
         self._rest(areas)
         return goal
@@ -202,16 +196,26 @@ class PyramidsBricks:
     ) -> np.ndarray:
         """Return in which of `areas` [n] an agent or a turning switch may touch a body within a tick."""
         place = self.bodies[areas, :, :3]
-
-        # the reach takes in the agent's way in this tick
-        speed = np.sqrt((velocity[areas] ** 2).sum(axis=1))
-        reach = RADII + (AGENT_RADIUS + MARGIN + speed * TICK_S)[:, None]
-        near = ((place - position[areas, None]) ** 2).sum(axis=2) < reach**2
+        near = self._beside(areas, position, velocity)
 
         turning = (switch_spin[areas] != 0)[:, None]
         beside = ((place - switch_position[areas, None]) ** 2).sum(axis=2)
 
-        return (near | (turning & (beside < (RADII + SWITCH_RADIUS + MARGIN) ** 2))).any(axis=1)
+        return near | (turning & (beside < (RADII + SWITCH_RADIUS + MARGIN) ** 2)).any(axis=1)
+
+    def _beside(self, areas: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Return in which of `areas` [n] an agent may touch a body within a tick."""
+        # the reach takes in the agent's way in this tick
+        speed = np.sqrt((velocity[areas] ** 2).sum(axis=1))
+        reach = RADII + (AGENT_RADIUS + MARGIN + speed * TICK_S)[:, None]
+        apart = ((self.bodies[areas, :, :3] - position[areas, None]) ** 2).sum(axis=2)
+        return (apart < reach**2).any(axis=1)
+
+    def _calm(self, areas: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Return in which of `areas` [n] neither bodies nor an agent beside them are fast."""
+        fastest = (self._speeds[areas, :, :3] ** 2).sum(axis=2).max(axis=1)
+        agent = (velocity[areas] ** 2).sum(axis=1) * self._beside(areas, position, velocity)
+        return np.maximum(fastest, agent) <= CALM_SPEED**2
 
     def _limit_spin(self, areas: np.ndarray) -> None:
         """Damp the bodies' spin and cap it, as the engine does at the start of a tick."""
@@ -234,60 +238,3 @@ def _clear_of_walls(root: np.ndarray) -> np.ndarray:
     centre, half = root + 0.5 * (low + high), 0.5 * (high - low)
     beside = np.abs(centre[:, None] - INNER_WALLS[:, [0, 2]])
     return ~(beside < half + INNER_WALLS[:, [3, 5]]).all(axis=2).any(axis=1)
-
-
-def _area_spec() -> mujoco.MjSpec:
-    """Return the MuJoCo description of one area: still walls, switch and stones (mocap), agent, pile.
-
-    The agent slides without friction on the floor and meets only the pile: all its other contacts are
-    rules of `bodies.py`. Its yaw is set, not pushed. The outer walls have no top, so that nothing
-    leaves the area.
-    """
-    walls = "".join(_box("", *wall) for wall in INNER_WALLS)
-    layers = "".join(_box("", x, rest_y, z, hx, hy, hz) for x, _, z, hx, hy, hz, rest_y in STONE_LAYERS)
-    stones = "".join(f'<body mocap="true" pos="0 -50 0">{layers}</body>' for i in range(6))
-
-    faces = (
-        (INSIDE_X[0], 0, "1 0 0"),
-        (INSIDE_X[1], 0, "-1 0 0"),
-        (0, INSIDE_Z[0], "0 0 1"),
-        (0, INSIDE_Z[1], "0 0 -1"),
-    )
-    planes = "".join(
-        f'<geom type="plane" size="0 0 1" pos="{x} 0 {z}" zaxis="{axis}" class="still"/>'
-        for x, z, axis in faces
-    )
-    cubes = "".join(
-        f'<body><freejoint/><geom class="loose" type="box" size="{h} {h} {h}" mass="2" name="{name}"/></body>'
-        for name, h in [*((f"brick{i}", 0.5) for i in range(len(BRICKS))), ("goal", 1.0)]
-    )
-
-    return mujoco.MjSpec.from_string(f"""
-<mujoco>
-  <option timestep="{TICK_S / SUBSTEPS}" gravity="0 -9.81 0" {_SOLVER}><flag island="disable"/></option>
-  <default>
-    <geom friction="0.6 0.005 0.0001" solref="0.01 2" solimp="0.95 0.99 0.001"/>
-    <default class="still"><geom contype="1" conaffinity="0"/></default>
-    <default class="loose"><geom contype="1" conaffinity="1"/></default>
-  </default>
-  <worldbody>
-    <geom type="plane" size="0 0 1" zaxis="0 1 0" class="still"/>
-    {planes}{walls}
-    <body name="switch" mocap="true" pos="0 -50 0">{_box("switch", 0, 0, 0, 2, 2, 2)}</body>
-    {stones}
-    <body name="agent" pos="0 0.5 0">
-      <joint type="slide" axis="1 0 0"/>
-      <joint type="slide" axis="0 0 1"/>
-      <joint type="hinge" axis="0 1 0" armature="1e6"/>
-      <geom name="agent" class="still" type="box" size="0.5 0.5 0.5" mass="25"/>
-    </body>
-    {cubes}
-  </worldbody>
-  <sensor><distance geom1="agent" geom2="goal" cutoff="1"/></sensor>
-</mujoco>
-""")
-
-
-def _box(name: str, x: float, y: float, z: float, half_x: float, half_y: float, half_z: float) -> str:
-    named = f'name="{name}" ' if name else ""
-    return f'<geom {named}class="still" type="box" pos="{x} {y} {z}" size="{half_x} {half_y} {half_z}"/>'
