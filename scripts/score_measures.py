@@ -86,7 +86,7 @@ MEASURES = (
     Measure("SoccerTwos", "won against Unity's policy", share_won, 0.5, "win_rate_vs_random", "unity"),
     Measure(
         *("StrikersVsGoalie", "decisions to a goal, random goalie", decisions_to_goal, 35.0),
-        column="match_decisions_vs_random",
+        column="Striker?team=0/match_decisions_vs_random",
         opponent="random",
         is_lower_better=True,
     ),

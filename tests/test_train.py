@@ -295,6 +295,27 @@ def test_sides_of_different_names_are_chosen_by_their_matches_too(tmp_path, monk
     assert checkpoint.load(tmp_path / "checkpoints" / "best.pt")["agent_steps"] == batch
 
 
+def test_where_the_strikers_always_win_the_best_is_who_scores_sooner(tmp_path, monkeypatch):
+    def sides(scored_after):
+        won, lost = ((1, scored_after),) * 32, ((-1, 50),) * 32
+        return {
+            "Striker?team=0": Score(wins=32, decisions=32 * scored_after, played=won),
+            "Goalie?team=1": Score(losses=32, decisions=32 * 50, played=lost),
+        }
+
+    scores = iter([sides(60), sides(40), sides(70)])
+    monkeypatch.setattr(series, "play_matches", lambda *args: next(scores))
+    batch = 2 * 3 * ROUNDS
+    matches = MatchConfig(interval=batch, count=64, opponents=0)
+    env, ppo = EnvConfig(name="StrikersVsGoalie", num_areas=2), PPOConfig(minibatch_size=40)
+    train(options(2, env=env, matches=matches, ppo=ppo, max_steps=3 * batch), tmp_path)
+
+    assert checkpoint.load(tmp_path / "checkpoints" / "best.pt")["agent_steps"] == 2 * batch
+    with open(tmp_path / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["Striker?team=0/match_decisions_vs_random"]) for row in rows] == [60, 40, 70]
+
+
 def test_matches_want_two_sides_and_say_so_before_the_first_step(tmp_path):
     with pytest.raises(ConfigError, match=r"matches.interval=100: .* two sides .* 3DBall has 3DBall\?team=0"):
         train(options(2, matches=MatchConfig(interval=100)), tmp_path)

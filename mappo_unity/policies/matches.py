@@ -9,7 +9,7 @@ groups) is positive at its end has won, one with a negative one has lost; anythi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -147,6 +147,16 @@ def count(episodes: list[Episode], grouped: bool) -> Score:
     return score
 
 
+def have_parts(sides: Iterable[str]) -> bool:
+    """Return whether two sides play different parts, a striker's and a goalie's: their behaviors differ.
+
+    Args:
+        sides: the names of the sides' behaviors, as `play_matches` returns them.
+    """
+    parts = {frozenset(policy_name(behavior) for behavior in side.split("+")) for side in sides}
+    return len(parts) == 2
+
+
 def points(sides: Mapping[str, Score]) -> tuple[float, float]:
     """Return points won and lost as both sides: a win counts 1, a draw 1/2.
 
@@ -160,8 +170,7 @@ def points(sides: Mapping[str, Score]) -> tuple[float, float]:
     total = sum(sides.values(), Score())
     won, lost = total.wins + 0.5 * total.draws, total.losses + 0.5 * total.draws
 
-    parts = [{policy_name(behavior) for behavior in side.split("+")} for side in sides]
-    if len(parts) == 2 and parts[0] != parts[1]:
+    if have_parts(sides):
         first, second = sides.values()
         for (result, decisions), (other_result, other_decisions) in zip(first.played, second.played):
             if result * other_result == -1:

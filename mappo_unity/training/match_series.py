@@ -27,7 +27,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.policies.layouts import sides_of
 from mappo_unity.policies.league.growing import GrowingLeague, Points, step_name
-from mappo_unity.policies.matches import Z95, Score, play_matches, points
+from mappo_unity.policies.matches import Z95, Score, have_parts, play_matches, points
 from mappo_unity.policies.policy import ActorPolicy, Policy, RandomPolicy
 from mappo_unity.policies.policy_files import RANDOM
 from mappo_unity.runs.folder import PLAYERS
@@ -108,7 +108,11 @@ class MatchSeries:
         self.said += ", the best so far" if self.is_best(agent_steps) else f"; the best is {self.league.best}"
 
         matches = max(1, total.matches)
+        by_side = met[RANDOM] if have_parts(met[RANDOM]) else {}
         return {
+            f"{side}/match_decisions_vs_random": score.decisions / max(1, score.matches)
+            for side, score in by_side.items()
+        } | {
             "win_rate_vs_random": total.figures()["won_of_decided"],
             "draw_rate_vs_random": total.draws / matches,
             "match_decisions_vs_random": total.decisions / matches,
