@@ -100,12 +100,15 @@ def _run(command: str, arguments: list[str] | None) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as in `mappo-eval ... | head -1`
         _drop_output()
         return 141
+
+    # what a user can mend, and what only the environment can
     except ConfigError as error:
         print(f"{name}: {error}", *error.details, sep="\n", file=sys.stderr)
         return 2
     except EnvironmentFailure as error:
         print(f"{name}: {error}", *error.details, sep="\n", file=sys.stderr)
         return 3
+
     except KeyboardInterrupt as error:
         if arguments is None:  # a second Ctrl-C would only find Python taking itself down
             signal.signal(signal.SIGINT, signal.SIG_IGN)

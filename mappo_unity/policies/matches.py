@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
 from mappo_unity.envs.backends import MakeEnv
@@ -174,9 +173,9 @@ def points(sides: Mapping[str, Score]) -> tuple[float, float]:
         first, second = sides.values()
         for (result, decisions), (other_result, other_decisions) in zip(first.played, second.played):
             if result * other_result == -1:
-                # whoever wins takes the time that is shorter; what each won and lost there cancels out
-                sooner = result * int(np.sign(other_decisions - decisions))
-                won, lost = won + sooner, lost - sooner
+                # we won once and lost once: a point to each so far
+                gained = result * ((decisions < other_decisions) - (decisions > other_decisions))
+                won, lost = won + gained, lost - gained
     return won, lost
 
 

@@ -21,6 +21,7 @@ from mappo_unity.policies.export import RunExports
 from mappo_unity.policies.warm_start.start import warm_start
 from mappo_unity.reports.dashboard import dashboard
 from mappo_unity.runs.logger import RunLog
+from mappo_unity.scenes.contract.statistics import Statistics
 from mappo_unity.signals import Interrupted
 from mappo_unity.training.collection.fleet import Batches
 from mappo_unity.training.episode_stats import by_policy
@@ -70,11 +71,11 @@ def train(
         resume_steps = state.agent_steps if resume_from is not None else None
         with RunLog(cfg.log, folder, cfg.max_steps, resume_steps, console) as log:
             # not before: until here something may be refused
-            log.message(f"run folder: {folder}" if resume_from is None else f"resuming from {resume_from}")
-            if address is not None:
-                log.message(f"dashboard: {address}")
-            for note in setup.notes + state.notes + started:
+            begun = f"run folder: {folder}" if resume_from is None else f"resuming from {resume_from}"
+            served = [] if address is None else [f"dashboard: {address}"]
+            for note in [begun, *served, *setup.notes, *state.notes, *started]:
                 log.message(note)
+
             exports = RunExports(folder, log.message) if cfg.export_onnx else None
             saver = CheckpointSaver(cfg, folder, state, exports, resume_from)
             stop = StopSignals(log.message)
@@ -130,12 +131,7 @@ def _iterate(
         for text in new_lessons:
             log.message(text)
 
-        series: dict[str, float] = {}
-        try:
-            series = state.play_matches()
-            saver.complete_matches()
-        finally:  # a series that fails costs no row
-            log.log(*with_statistics(row | series, statistics))
+        series = _play_series(state, saver, log, row, statistics)
         for text in watch.news() + ([state.matches.said] if series else []):
             log.message(text)
 
@@ -147,6 +143,19 @@ def _iterate(
     # the loop is over: the timer of a first signal must not break off the last checkpoint
     stop.end_patience()
     return status
+
+
+def _play_series(
+    state: RunState, saver: CheckpointSaver, log: RunLog, row: dict[str, float], statistics: Statistics
+) -> dict[str, float]:
+    """Play the series of matches that is due, if one is, and log the iteration's row; return its figures."""
+    series: dict[str, float] = {}
+    try:
+        series = state.play_matches()
+        saver.complete_matches()
+    finally:  # a series that fails costs no row
+        log.log(*with_statistics(row | series, statistics))
+    return series
 
 
 def _status(cfg: Config, state: RunState, stop: StopSignals) -> str | None:

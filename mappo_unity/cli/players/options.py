@@ -103,7 +103,10 @@ def _parser() -> Parser:
         metavar="N",
         help=f"port of this machine on which the trainer listens; default {EDITOR_PORT}",
     )
+
+    # spelled as Unity's players spell it
     parser.add_argument("-logFile", "-logfile", dest="log_file", metavar="PATH", help="log; default stdout")
+
     parser.add_argument(
         "--num-areas",
         type=whole_number,

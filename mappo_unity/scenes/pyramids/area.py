@@ -38,19 +38,23 @@ def area_spec(substeps: int) -> mujoco.MjSpec:
     <default class="still"><geom contype="1" conaffinity="0"/></default>
     <default class="loose"><geom contype="1" conaffinity="1"/></default>
   </default>
+
   <worldbody>
     <geom type="plane" size="0 0 1" zaxis="0 1 0" class="still"/>
     {_outer_planes()}{walls}
     <body name="switch" mocap="true" pos="0 -50 0">{_box("switch", 0, 0, 0, 2, 2, 2)}</body>
     {stones}
+
     <body name="agent" pos="0 0.5 0">
       <joint type="slide" axis="1 0 0"/>
       <joint type="slide" axis="0 0 1"/>
       <joint type="hinge" axis="0 1 0" armature="1e6"/>
       <geom name="agent" class="still" type="box" size="0.5 0.5 0.5" mass="25"/>
     </body>
+
     {cubes}
   </worldbody>
+
   <sensor><distance geom1="agent" geom2="goal" cutoff="1"/></sensor>
 </mujoco>
 """)

@@ -195,13 +195,10 @@ class PyramidsBricks:
         switch_spin: np.ndarray,
     ) -> np.ndarray:
         """Return in which of `areas` [n] an agent or a turning switch may touch a body within a tick."""
-        place = self.bodies[areas, :, :3]
-        near = self._beside(areas, position, velocity)
+        apart = ((self.bodies[areas, :, :3] - switch_position[areas, None]) ** 2).sum(axis=2)
+        by_switch = (apart < (RADII + SWITCH_RADIUS + MARGIN) ** 2).any(axis=1)
 
-        turning = (switch_spin[areas] != 0)[:, None]
-        beside = ((place - switch_position[areas, None]) ** 2).sum(axis=2)
-
-        return near | (turning & (beside < (RADII + SWITCH_RADIUS + MARGIN) ** 2)).any(axis=1)
+        return self._beside(areas, position, velocity) | ((switch_spin[areas] != 0) & by_switch)
 
     def _beside(self, areas: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Return in which of `areas` [n] an agent may touch a body within a tick."""
