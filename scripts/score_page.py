@@ -147,7 +147,7 @@ def draw_scene(scene: str, measures: list[Measure], path: Path) -> None:
             draw_levels(axis, measure, of(measure, rows))
             axis.set(xlabel=label)
             axis.grid(alpha=0.3)
-        left.set(ylabel=measure.column.replace("_", " "), title=scene)
+        left.set(ylabel=measure.column.replace("/", "\n").replace("_", " "), title=scene)
         right.legend(fontsize="small")
     figure.savefig(path, dpi=80)
     pyplot.close(figure)
