@@ -100,6 +100,10 @@ TOLD = [
     ),
     ("train env=Basic rewards.rnd.lr=0.01", "rewards.rnd.lr=0.01 has no effect without rewards.rnd.strength"),
     ("train env=Basic rewards.extrinsic.strength=0", "rewards.extrinsic.strength=0 leaves Basic nothing"),
+    (
+        "train env=Basic rewards.rnd.strength=0.1 rewards.rnd.steps=-1",
+        "rewards.rnd.steps=-1 is out of range: rewards.rnd.steps must be >= 0",
+    ),
     ("train env=Basic rewards.rnd.strength=much", "rewards.rnd.strength=much does not fit"),
     ("train env=Basic rewards.gail.strength=nan", "rewards.gail.strength=nan is out of range"),
     ("train env=Basic rewards.curiosity.normalize=no", "rewards.curiosity.normalize=no does not fit"),

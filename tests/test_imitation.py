@@ -133,7 +133,8 @@ def test_the_strength_falls_to_nothing() -> None:
     spec = ActionSpec(0, (2,))
     actor = actor_of(spec)
     expert = make_expert(demonstration(spec), ["observation"], "cpu")
-    cloning = Cloning(actor, expert, BCConfig(demos=["x"], strength=0.5), PPOConfig(), share=0.2)
+    cfg = BCConfig(demos=["x"], strength=0.5, steps=200)
+    cloning = Cloning(actor, expert, cfg, PPOConfig(), max_steps=1000)
     told = [cloning.learn(60, 1e-3, progress).get("bc_strength") for progress in (0.0, 0.1, 0.2, 0.9)]
     assert told == pytest.approx([0.5, 0.25, 0.0, 0.0])
     before = [p.clone() for p in actor.parameters()]

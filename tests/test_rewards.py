@@ -170,6 +170,30 @@ def test_normalised_rewards_have_returns_of_deviation_one() -> None:
     assert torch.allclose(plain.rewards(seen, view)[0], 0.5 * stream.model.rewards(seen))
 
 
+def test_the_strength_of_a_stream_falls_to_nothing() -> None:
+    layout, cfg = ActionLayout(2, ()), RNDConfig(hidden=[16], strength=0.5, steps=200, normalize=False)
+    stream = IntrinsicStream("rnd", RandomNetwork(ObsLayout(5), layout, cfg), cfg, max_steps=1000)
+    seen = decisions(layout)
+    valued = np.ones((64, 1), bool)
+    view = DecisionView.of(valued, valued[0], np.zeros_like(valued))
+
+    whole_reward = stream.rewards(seen, view)[0]
+    told = [stream.begin(progress)["rnd_strength"] for progress in (0.0, 0.2, 0.9, 0.1)]
+    assert told == pytest.approx([0.5, 0.0, 0.0, 0.25])
+    assert torch.allclose(stream.rewards(seen, view)[0], 0.5 * whole_reward)
+
+    # in the end nothing is earned, and the model learns no more
+    stream.begin(0.2)
+    before = [p.clone() for p in stream.model.parameters()]
+    reward, metrics = stream.rewards(seen, view)
+    assert not reward.any() and metrics == {} and stream.learn(seen, PPOConfig()) == {}
+    assert all(torch.equal(a, b) for a, b in zip(before, stream.model.parameters()))
+
+    # without steps it stays, and nothing is said
+    stays = IntrinsicStream("rnd", stream.model, RNDConfig(strength=0.5), max_steps=1000)
+    assert stays.begin(1.0) == {} and stays.left == 1.0
+
+
 def test_without_a_decision_whose_outcome_is_known_nothing_is_earned_and_learnt() -> None:
     layout, cfg = ActionLayout(2, ()), RNDConfig(hidden=[16], strength=0.5)
     stream = IntrinsicStream("rnd", RandomNetwork(ObsLayout(5), layout, cfg), cfg)
@@ -273,6 +297,7 @@ def test_a_run_with_streams_is_resumed_to_the_bit(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     line = ["env=3DBall", *SMALL, "collect.batch_size=240", "ppo.lr_schedule=constant"]
+    line += ["rewards.rnd.steps=720"]
     assert train_main([*line, "max_steps=960", "hydra.run.dir=whole"]) == 0
     assert train_main([*line, "max_steps=480", "hydra.run.dir=parts"]) == 0
     assert train_main(["resume=parts", "max_steps=960"]) == 0

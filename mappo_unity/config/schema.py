@@ -540,6 +540,9 @@ class IntrinsicConfig:
 
     strength: float = 0.0
     """Factor of the reward; 0: this stream is off."""
+    steps: int = 0
+    """Agent decisions over which the strength falls to 0, so that what is learnt in the end is for the
+    environment's rewards alone; 0: it stays."""
     gamma: float = 0.99
     """Discount of the reward."""
     lr: float = 3e-4
@@ -553,6 +556,7 @@ class IntrinsicConfig:
 
     def __post_init__(self) -> None:
         _at_least(f"{self._section}.strength", self.strength, 0)
+        _at_least(f"{self._section}.steps", self.steps, 0)
         _within(f"{self._section}.gamma", self.gamma, 0, 1)
         _above(f"{self._section}.lr", self.lr, 0)
         _check_widths(f"{self._section}.hidden", self.hidden)

@@ -209,3 +209,14 @@ def scheduled(schedule: Schedule, start: float, final: float, progress: float) -
     if schedule is Schedule.cosine:
         progress = 0.5 - 0.5 * math.cos(math.pi * progress)
     return start + (final - start) * progress
+
+
+def share_left(steps: int, max_steps: int, progress: float) -> float:
+    """Return what is left of a strength that falls to 0 over the first `steps` decisions; 0 steps: all.
+
+    Args:
+        steps: agent decisions after which nothing is left.
+        max_steps: agent decisions of the run.
+        progress: share of the run that is over, 0 to 1.
+    """
+    return max(0.0, 1 - progress * max_steps / steps) if steps else 1.0

@@ -120,7 +120,7 @@ class PolicyLearner:
             following: what was seen after them, see `keys.FINAL`, `keys.CUT_OFF` and `keys.CUT_OFF_AT`.
             progress: share of the run that is over, 0 to 1, for the schedules.
         """
-        settings = self._set_schedules(progress) | self.warmup.begin(batch)
+        settings = self._set_schedules(progress) | self.rewards.begin(progress) | self.warmup.begin(batch)
         for norm in self.norms if self.actor.moving_norms else ():
             norm.load_state_dict(self.actor.moving_norms[0].state_dict())  # the critic's follow
 

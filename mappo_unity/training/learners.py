@@ -83,13 +83,12 @@ def _make_learner(
 
     # a value for each stream of rewards
     judged = expert(rewards.gail.demos) if rewards.gail.strength else None
-    intrinsic = make_intrinsic(obs, layout, rewards, cfg.device, judged)
+    intrinsic = make_intrinsic(obs, layout, rewards, cfg, judged)
     critic = make_critic(obs, team_size, model, layout, 1 + len(intrinsic)).to(cfg.device)
     shares = model.critic is CriticKind.poca and team_size > 1
     streams = RewardStreams(ppo, rewards, intrinsic, obs.keys, shares)
 
-    share = bc.steps / cfg.max_steps if bc.steps else None
-    cloning = Cloning(actor, expert(bc.demos), bc, ppo, share) if bc.demos else None
+    cloning = Cloning(actor, expert(bc.demos), bc, ppo, cfg.max_steps) if bc.demos else None
     return PolicyLearner(actor, critic, ppo, streams, cloning)
 
 

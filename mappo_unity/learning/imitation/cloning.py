@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mappo_unity.config.schema import BCConfig, PPOConfig
+from mappo_unity.learning.advantage import share_left
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import ActionDistribution
@@ -27,13 +28,14 @@ class Cloning:
         expert: what it learns from.
         cfg: strength, and whether nothing else teaches the actor.
         ppo: epochs, minibatches and, with a memory, the length of sequences.
-        share: share of the run after which the strength is 0; None: it stays.
+        max_steps: agent decisions of the run.
     """
 
     def __init__(
-        self, actor: UnityActor, expert: Expert, cfg: BCConfig, ppo: PPOConfig, share: float | None = None
+        self, actor: UnityActor, expert: Expert, cfg: BCConfig, ppo: PPOConfig, max_steps: int = 0
     ) -> None:
-        self._actor, self._expert, self.cfg, self._ppo, self._share = actor, expert, cfg, ppo, share
+        self._actor, self._expert, self.cfg, self._ppo = actor, expert, cfg, ppo
+        self._max_steps = max_steps
         self.optimizer = torch.optim.Adam(actor.parameters(), lr=ppo.lr)
         self._pieces = _cut(expert.first, ppo.sequence_length if actor.has_memory else 1)
 
@@ -46,7 +48,7 @@ class Cloning:
             lr: PPO's learning rate now.
             progress: share of the run that is over, 0 to 1.
         """
-        left = 1.0 if self._share is None else max(0.0, 1 - progress / self._share)
+        left = share_left(self.cfg.steps, self._max_steps, progress)
         if left == 0.0:
             return {"bc_strength": 0.0}
 

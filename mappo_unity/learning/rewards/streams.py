@@ -14,7 +14,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from mappo_unity import keys
-from mappo_unity.config.schema import IntrinsicConfig, PPOConfig, RewardsConfig
+from mappo_unity.config.schema import Config, IntrinsicConfig, PPOConfig, RewardsConfig
+from mappo_unity.learning.advantage import share_left
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.distributions import ActionLayout
@@ -35,16 +36,24 @@ class IntrinsicStream:
         name: of the stream, as in the options.
         model: has ``rewards(decisions)``, float32 ``[D]``, and ``loss(decisions)``, a scalar.
         cfg: the stream's options.
+        max_steps: agent decisions of the run.
+
+    Attributes: `left`, share of the strength that is left; once it is 0, nothing is earned and learnt.
     """
 
-    def __init__(self, name: str, model: nn.Module, cfg: IntrinsicConfig) -> None:
-        self.name, self.cfg = name, cfg
+    def __init__(self, name: str, model: nn.Module, cfg: IntrinsicConfig, max_steps: int = 0) -> None:
+        self.name, self.cfg, self._max_steps, self.left = name, cfg, max_steps, 1.0
         self.model: Any = model
         learns = [parameter for parameter in model.parameters() if parameter.requires_grad]
         self.optimizer = torch.optim.Adam(learns, lr=cfg.lr)
         self.norms = running_norms(model)
         self.returns = RunningNorm(1)  # of discounted sums of the reward
         self.returns.epsilon = 1e-12  # a predictor's errors become small
+
+    def begin(self, progress: float) -> dict[str, float]:
+        """Set the strength of the update that begins, after this share of the run; return a metric of it."""
+        self.left = share_left(self.cfg.steps, self._max_steps, progress)
+        return {f"{self.name}_strength": self.cfg.strength * self.left} if self.cfg.steps else {}
 
     @torch.no_grad()
     def rewards(self, decisions: Transitions, view: DecisionView) -> tuple[Tensor, dict[str, float]]:
@@ -55,7 +64,7 @@ class IntrinsicStream:
             view: ``[R, N]``.
         """
         reward = torch.zeros(view.valued.size, device=decisions.at.device)
-        if not len(decisions):
+        if not len(decisions) or not self.left:
             return reward, {}
 
         # vectors are known before they are judged: nothing here must stand still during an update
@@ -71,7 +80,7 @@ class IntrinsicStream:
         if self.cfg.normalize:
             self._scale(reward, decisions, view)
         mean = float(reward[decisions.at].mean())
-        return self.cfg.strength * reward, {f"{self.name}_reward": mean}
+        return self.cfg.strength * self.left * reward, {f"{self.name}_reward": mean}
 
     def _scale(self, reward: Tensor, decisions: Transitions, view: DecisionView) -> None:
         """Divide rewards by the deviation of their discounted sums (Burda et al., section 2.4)."""
@@ -82,6 +91,9 @@ class IntrinsicStream:
 
     def learn(self, decisions: Transitions, cfg: PPOConfig) -> dict[str, float]:
         """Teach the model these decisions, in the policy's epochs and minibatches; return metrics."""
+        if not self.left:
+            return {}
+
         losses = []
         for _ in range(cfg.epochs):
             order = torch.randperm(len(decisions)).to(decisions.at.device)
@@ -133,6 +145,13 @@ class RewardStreams:
         self._weights += [(keys.GROUP_REWARD, own.strength * ppo.group_reward_weight)]
         self._decisions: Transitions | None = None  # of the batch in hand, until it is learnt
 
+    def begin(self, progress: float) -> dict[str, float]:
+        """Set the strengths of the update that begins, after this share of the run; return them."""
+        strengths: dict[str, float] = {}
+        for stream in self.intrinsic:
+            strengths |= stream.begin(progress)
+        return strengths
+
     def rewards(
         self, rounds: TensorDict, following: TensorDictBase, view: DecisionView
     ) -> tuple[Tensor, dict[str, float]]:
@@ -176,18 +195,21 @@ class RewardStreams:
 
 
 def make_intrinsic(
-    obs: ObsLayout, layout: ActionLayout, cfg: RewardsConfig, device: str, expert: Expert | None = None
+    obs: ObsLayout, layout: ActionLayout, cfg: RewardsConfig, run: Config, expert: Expert | None = None
 ) -> list[IntrinsicStream]:
     """Build the intrinsic streams that are on.
 
     Args:
         obs, layout: what an agent observes and does.
         cfg: the streams' options.
-        device: of the networks.
+        run: the options of the run: its device and its length.
         expert: the demonstrations, where GAIL is on.
     """
     models = make_models(obs, layout, cfg, expert)
-    return [IntrinsicStream(name, model.to(device), cfg.intrinsic[name]) for name, model in models.items()]
+    return [
+        IntrinsicStream(name, model.to(run.device), cfg.intrinsic[name], run.max_steps)
+        for name, model in models.items()
+    ]
 
 
 def make_models(
