@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from mappo_unity.cli import train_main
+from mappo_unity.config.compose import compose_config
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.policies.episodes import standard_error, summarize
 from mappo_unity.runs import checkpoint
 from mappo_unity.training.episode_stats import RecentEpisodes
+from mappo_unity.training.run_state import RunState
+from mappo_unity.training.saver import CheckpointSaver
+from mappo_unity.training.setup import set_up
 
 
 def test_episodes_of_agents_alone_have_the_textbook_s_standard_error():
@@ -38,6 +42,33 @@ def test_the_first_few_episodes_to_end_are_no_score():
     assert window.score() == 0.75
     window.forget()
     assert window.score() == -math.inf
+
+
+def test_the_window_s_standard_error():
+    window = RecentEpisodes(4, ["Left", "Right"])
+    assert window.standard_error() == 0.0
+    window.add({"Left": ended(1.0, 3.0), "Right": ended(1.0, 3.0)})
+    assert window.standard_error() == 0.5  # deviation 1, four episodes
+
+
+def test_the_newest_of_those_that_cannot_be_told_from_the_highest_is_the_best(tmp_path):
+    lines = ["env=Basic", "env.num_areas=4", "model.hidden=[8]", "log.return_window=4"]
+    cfg = compose_config([*lines, "checkpoint_interval=1"]).config
+    windows = [(1.0, 3.0), (0.6, 2.8), (1.45, 1.85), (2.0, 2.0)]  # means 2, 1.7, 1.65 and 2
+
+    with set_up(cfg, tmp_path) as setup:
+        state = RunState(cfg, tmp_path, setup)
+        saver = CheckpointSaver(cfg, tmp_path, state, exports=None, last=None)
+        chosen = []
+        for number, returns in enumerate(windows, 1):
+            state.recent_episodes.add({"Basic?team=0": ended(*returns, *returns)})
+            state.iteration = state.agent_steps = number
+            saver.complete()
+            saver.save()
+            chosen.append(checkpoint.load(saver.best)["agent_steps"])
+
+    assert chosen == [1, 2, 2, 4], "the third is near the second, but not near the highest"
+    assert state.best_score == 2.0
 
 
 def test_lucky_early_episodes_do_not_choose_the_best_checkpoint(tmp_path):

@@ -55,6 +55,11 @@ class RecentEpisodes:
         count = sum(len(rows) for rows in self.recent.values())
         return self.summary()["return_mean"] if count >= self.size else -math.inf
 
+    def standard_error(self) -> float:
+        """Return that of the mean return, 0 of no episodes; team mates, who earn the same, count each."""
+        count = sum(len(rows) for rows in self.recent.values())
+        return self.summary()["return_std"] / math.sqrt(count) if count else 0.0
+
     def summary(self) -> dict[str, float]:
         """Return means over the window, over all behaviors and, if several, for each of them.
 

@@ -52,7 +52,7 @@ class RunState:
 
     Attributes: `iteration`, how many are complete; `agent_steps`, agent decisions; `policy_steps`, those of
     each policy; `wall_s`, seconds spent collecting and learning; `saved_at`, agent decisions at the last
-    regular checkpoint; `best_score`, of the best checkpoint, which matches choose without it;
+    regular checkpoint; `best_score`, the highest of a checkpoint, of which matches ask nothing;
     `dropped_episodes` and `dropped_steps`, what crashed players cost; `samples`, inputs of each policy that
     an export is compared on; `self_play`, the opponents, where there are some; `notes`, lines for the user
     about what a checkpoint could not give back.
@@ -196,12 +196,13 @@ class RunState:
     def is_best(self) -> bool:
         """Return whether the policy is the best so far: by `score`; where there are two sides, by matches.
 
-        There one side's gain is the other's loss, and the mean return says nothing.
+        The highest of many windows is the luckiest, so the newest counts that is not more than one standard
+        error below (Breiman et al. 1984: the 1 SE rule). Of two sides the mean return says nothing.
         """
         if self.matches.two_sided and not self.cfg.bc.only:
             return self.matches.is_best(self.agent_steps)
-        score = self.score()  # while too few episodes have ended the newest policy has learnt most
-        return score > self.best_score or score == self.best_score == -math.inf
+        # while too few episodes have ended both are minus infinity: the newest policy has learnt most
+        return self.score() >= self.best_score - self.recent_episodes.standard_error()
 
     # --- checkpoints
 

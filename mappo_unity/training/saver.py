@@ -72,7 +72,7 @@ class CheckpointSaver:
 
         best = state.is_best()
         if best:
-            state.best_score = state.score()
+            state.best_score = max(state.best_score, state.score())
         if self.last is not None:  # the first one comes early and is not part of the rhythm
             state.saved_at = complete["agent_steps"]
         # both are known only now, and a resumed run needs them
