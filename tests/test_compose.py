@@ -137,6 +137,7 @@ def test_run_folder_is_named_by_env_and_by_the_user() -> None:
         ("env=", ["env=", "does not exist", "choices: 3DBall"]),
         ("sed=3", ["sed is not an option", "did you mean seed", "max_steps"]),
         ("lr=1", ["lr is not an option", "did you mean ppo.lr"]),
+        ("search=ppo", ["search is not an option of this command", "mappo-search takes it"]),
         ("ppo.gama=0.9", ["ppo.gama", "did you mean ppo.gamma", "ppo.clip_epsilon"]),
         ("pppo.lr=1", ["pppo.lr is not an option", "did you mean ppo.lr", "ppo.*"]),
         ("+extra=1", ["extra is not an option"]),

@@ -264,19 +264,19 @@ def _scratch(schema: type) -> DictConfig:
 
 
 def _unknown(key: str, table: dict[str, Option], groups: dict[str, list[str]]) -> str:
-    names = [name for name, option in table.items() if not option.is_section] + list(groups)
-    inside = _inside(key.rpartition(".")[0], table)
-    if not inside:
-        sections = [f"{name}.*" for name, option in table.items() if option.is_section]
-        inside = [name for name in names if "." not in name] + sections
+    if key.split(".")[0] == "search":
+        return f"{key} is not an option of this command: mappo-search takes it (mappo-search --help)"
 
-    choices = ", ".join(inside)
+    names = [name for name, option in table.items() if not option.is_section] + list(groups)
+    sections = [f"{name}.*" for name, option in table.items() if option.is_section]
+    inside = _inside(key.rpartition(".")[0], table)
+    choices = ", ".join(inside or [name for name in names if "." not in name] + sections)
     return f"{key} is not an option{did_you_mean(key, names)}; choices: {choices} (--help describes them)"
 
 
 def _inside(section: str, table: dict[str, Option]) -> list[str]:
-    below = [name for name in table if section and name.startswith(f"{section}.")]
-    return [name for name in below if not table[name].is_section]
+    begin = f"{section}."
+    return [name for name, option in table.items() if name.startswith(begin) and not option.is_section]
 
 
 def _values(override: Override) -> Iterator[Any]:
