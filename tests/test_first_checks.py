@@ -76,6 +76,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "junk.onnx").write_text("words")
     (folder / "ball" / "checkpoints" / "best.onnx").write_text("words")
     (folder / "nothing").mkdir()
+    (folder / "broken_league").mkdir()
+    (folder / "broken_league" / "league.json").write_text("{")
     (folder / "only_onnx").mkdir()
     (folder / "only_onnx" / "3DBall.onnx").write_text("words")
     (folder / "loop").symlink_to(folder / "loop")
@@ -168,6 +170,7 @@ TOLD = [
     ("league random alone.pt", "none of the policies lies in the folder of a run"),
     ("league soccer random out=text.txt", "out=text.txt is a file: give a folder for the results"),
     ("league soccer random out=ball", "out=ball is not empty and holds no league: give a new folder"),
+    ("league soccer random out=broken_league", "league.json is no record of a league any more"),
     ("league soccer random workers=0", "workers=0 is out of range: workers must be >= 1"),
     ("league soccer random env.file_name=Game", "env.file_name=Game has no effect with env.backend=embedded"),
     ("league soccer random env.backend=editor", "env.backend=editor: a league opens the environment anew"),

@@ -154,7 +154,7 @@ def test_values_become_lines_that_mappo_train_reads() -> None:
         (["search=space.yaml", "-m"], ["-m is not an option"]),
         (["search=space.yaml", "env=Nope"], ["env=Nope does not exist"]),
         (["search=space.yaml", "out=space.yaml"], ["out=space.yaml is a file"]),
-        (["search=space.yaml", "out=."], ["holds something else", "search.json"]),
+        (["search=space.yaml", "out=."], ["out=. is not empty and holds no search", "give a new folder"]),
     ],
 )
 def test_a_search_that_cannot_be_is_told(
@@ -165,6 +165,14 @@ def test_a_search_that_cannot_be_is_told(
     assert captured.out == "" and [path.name for path in Path().iterdir()] == ["space.yaml"]
     for word in words:
         assert word in captured.err
+
+
+def test_a_damaged_record_of_a_search_is_told(any_optuna: None) -> None:
+    Path("space.yaml").write_text("ppo.gamma: {low: 0.9, high: 0.99}\n")
+    Path("folder").mkdir()
+    Path("folder/search.json").write_text("[]")
+    with pytest.raises(ConfigError, match="search.json is no record of a search any more: give a new folder"):
+        make_plan(out="folder")
 
 
 def test_values_at_the_ends_of_the_space_are_tried_first(any_optuna: None) -> None:

@@ -23,6 +23,7 @@ from mappo_unity.policies.league.words import short_names
 from mappo_unity.policies.policy_files import RANDOM, SUFFIX, Kind, Source, choose_checkpoint, locate
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.folder import find_run
+from mappo_unity.runs.json_record import record_to_resume
 from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes.mujoco_check import check_mujoco
 
@@ -183,26 +184,16 @@ def _digest(file: str) -> str:
 
 def _check_folder(league: League) -> None:
     """Raise ConfigError if the folder for the results is that of another league, or of something else."""
-    folder, file = league.folder, league.folder / RECORD
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"out={folder} is a file: give a folder for the results")
-    if not file.is_file():
-        if folder.is_dir() and [path for path in folder.iterdir() if not path.name.startswith(".")]:
-            raise ConfigError(f"out={folder} is not empty and holds no league: give a new folder")
+    saved = record_to_resume(league.folder, RECORD, "league")
+    if saved is None:
         return
-
-    try:
-        saved = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError:
-        saved = None
-    if not isinstance(saved, dict):
-        raise ConfigError(f"{file} is no record of a league any more: give a new folder as out")
 
     wanted = json.loads(_text(league.record()))
     differing = [name for name in wanted if saved.get(name) != wanted[name]]
     if differing:
+        names = " and ".join(map(_named, differing))
         raise ConfigError(
-            f"out={folder} holds another league, which differs in {' and '.join(map(_named, differing))} "
+            f"out={league.folder} holds another league, which differs in {names} "
             f"({_difference(saved, wanted, differing[0])}): give another folder as out, or the same options, "
             "and it goes on"
         )

@@ -18,6 +18,7 @@ from mappo_unity.config.schema import Config, SearchConfig, SearchObjective
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.first_checks import check_environment
 from mappo_unity.policies.warm_start.sources import adopt_file_options
+from mappo_unity.runs.json_record import record_to_resume
 from mappo_unity.training.search.space import Range, Space, read_space, to_line
 
 RECORD = "search.json"
@@ -171,23 +172,14 @@ def _value(config: Config, key: str) -> Any:
 
 def _check_folder(plan: SearchPlan) -> None:
     """Raise ConfigError where the folder holds something other than this search."""
-    folder, record = plan.folder, plan.folder / RECORD
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"out={folder} is a file: it must name a folder")
-    if not folder.is_dir() or not any(folder.iterdir()):
+    saved = record_to_resume(plan.folder, RECORD, "search")
+    if saved is None:
         return
-    if not record.is_file():
-        raise ConfigError(f"out={folder} holds something else: no {RECORD} there; name a new folder")
-
-    try:
-        saved = json.loads(record.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ConfigError(f"{record} cannot be read ({error})") from error
 
     wanted = json.loads(json.dumps(plan.record()))
     for name in wanted:
         if saved.get(name) != wanted[name]:
             raise ConfigError(
-                f"out={folder} holds another search: {name} {json.dumps(saved.get(name))} there, "
+                f"out={plan.folder} holds another search: {name} {json.dumps(saved.get(name))} there, "
                 f"{json.dumps(wanted[name])} here; name a new folder, or give the same options"
             )
