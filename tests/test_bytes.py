@@ -21,6 +21,8 @@ from mappo_unity.config.compose import compose_config
 from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout, in_floats
 from mappo_unity.learning.networks.images import by_pixel
+from mappo_unity.learning.rewards.rnd import RandomNetwork
+from mappo_unity.learning.transitions import Transitions
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.contract.images import ByteImage, from_bytes, to_bytes
 from mappo_unity.scenes.contract.rules import EnvironmentDataError
@@ -131,6 +133,24 @@ def test_minibatches_of_grids_lie_pixel_by_pixel_in_memory(tmp_path: Path) -> No
             buffer, _ = learner.prepare(rounds, following)
 
         assert rounds.get("obs_0").stride()[-3:] == (1600, 40, 1)  # the batch itself stays as it was
+
+
+def test_novelty_of_grids_is_learnt_pixel_by_pixel_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strides = set()
+    loss = RandomNetwork.loss
+
+    def spy(network: RandomNetwork, decisions: Transitions) -> torch.Tensor:
+        strides.update(grids.stride() for grids in decisions.next_obs if grids.ndim == 4)
+        return loss(network, decisions)
+
+    monkeypatch.setattr(RandomNetwork, "loss", spy)
+    cfg = compose_config([*GRIDS, "rewards.rnd.strength=0.1"]).config
+    with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
+        (learner,) = setup.learners.values()
+        learner.learn(*next(batches).of("GridFoodCollector"), 0.0)
+    assert strides == {(8000, 1, 200, 5)}
 
 
 def test_images_by_pixel_hold_the_same() -> None:

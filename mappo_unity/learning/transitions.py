@@ -81,7 +81,7 @@ def find_transitions(
     onward[ended] = (number + 1) * slots + team_row * members + ends % members
 
     parts = rounds, following.get(keys.FINAL), following.get(keys.CUT_OFF)
-    table = [torch.cat([part.get(key).flatten(0, part.ndim - 1) for part in parts]) for key in obs_keys]
+    table = [_rows([part.get(key).flatten(0, part.ndim - 1) for part in parts]) for key in obs_keys]
 
     device = acting.device
     index = torch.from_numpy(rows).to(device)
@@ -92,6 +92,15 @@ def find_transitions(
         rounds.get(keys.ACTION).flatten(0, rounds.ndim - 1)[index],
         torch.from_numpy(ended).to(device),
     )
+
+
+def _rows(parts: list[Tensor]) -> Tensor:
+    """Return observations ``[*, ...]`` in one, in memory as the first ones are (see `by_pixel`)."""
+    first, *others = parts
+    is_by_pixel = first.ndim == 4 and first.is_contiguous(memory_format=torch.channels_last)
+    layout = torch.channels_last if is_by_pixel else torch.contiguous_format
+    # one without rows has no layout, and would undo that of the others
+    return torch.cat([first, *(part.contiguous(memory_format=layout) for part in others if len(part))])
 
 
 def env_actions(action: Tensor, layout: ActionLayout) -> Tensor:
