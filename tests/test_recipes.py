@@ -88,7 +88,11 @@ def check(ours, theirs, behaviors=1):
     assert ppo.time_horizon == theirs["time_horizon"]
     assert ppo.minibatch_size == hyper["batch_size"] and ppo.num_minibatches is None
     assert ours.collect.batch_size == behaviors * hyper["buffer_size"] and ours.collect.rounds is None
-    assert ppo.gamma == theirs["reward_signals"]["extrinsic"]["gamma"]
+    signals = theirs["reward_signals"]
+    assert ppo.gamma == signals["extrinsic"]["gamma"]
+    for name in ("curiosity", "rnd", "gail"):
+        stream = getattr(ours.rewards, name)
+        assert (stream.strength, stream.steps) == (signals.get(name, {}).get("strength", 0.0), 0)
 
     assert model.hidden == [net["hidden_units"]] * net["num_layers"] and model.critic_hidden is None
     assert model.normalize_obs == net["normalize"]
