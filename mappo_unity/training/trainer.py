@@ -85,16 +85,31 @@ def train(
             with setup.collecting() as batches, stop.taken():
                 state.restore_rng()
                 state.begin()
-                try:
-                    status = _iterate(cfg, batches, state, saver, log, watch, stop, after_iteration)
-                    saver.finish()
-                except BaseException as error:
-                    with stop.ignored():
-                        saver.rescue(log.message_if_possible)
-                    if not isinstance(error, Interrupted) or saver.last is None:
-                        raise  # an interrupted run has an outcome only where it can be resumed
-                    status = INTERRUPTED
+                status = _iterate_and_save(cfg, batches, state, saver, log, watch, stop, after_iteration)
             return _outcome(status, state, saver, stop)
+
+
+def _iterate_and_save(
+    cfg: Config,
+    batches: Batches,
+    state: RunState,
+    saver: CheckpointSaver,
+    log: RunLog,
+    watch: Watch,
+    stop: StopSignals,
+    after_iteration: AfterIteration | None,
+) -> str:
+    """Iterate, and save the last complete iteration whatever ends that; return the status."""
+    try:
+        status = _iterate(cfg, batches, state, saver, log, watch, stop, after_iteration)
+        saver.finish()
+    except BaseException as error:
+        with stop.ignored():
+            saver.rescue(log.message_if_possible)
+        if not isinstance(error, Interrupted) or saver.last is None:
+            raise  # an interrupted run has an outcome only where it can be resumed
+        return INTERRUPTED
+    return status
 
 
 def _iterate(
