@@ -35,8 +35,15 @@ RACE = ROOT / "docs/benchmarks/race.csv"
 PAGE = ROOT / "docs/benchmarks/race.md"
 PEER, PLAYER, EMBEDDED = "mlagents-learn", "preset through the player", "preset embedded"
 COLORS = {PEER: "tab:orange", PLAYER: "tab:cyan", EMBEDDED: "tab:blue"}
-TARGETS = {"3DBall": 95.0, "Basic": 0.9, "DungeonEscape": 0.5, "Hallway": 0.7, "PushBlock": 4.5}
-TARGETS |= {"WallJump": 0.8, "Pyramids": 1.75}
+TARGETS = {
+    "3DBall": 95.0,
+    "Basic": 0.9,
+    "DungeonEscape": 0.5,
+    "Hallway": 0.7,
+    "PushBlock": 4.5,
+    "Pyramids": 1.75,
+    "WallJump": 0.8,
+}
 """Returns that show a scene learnt."""
 WINDOW = 100  # episodes of a mean
 POINTS = 60  # of a curve

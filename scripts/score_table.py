@@ -28,8 +28,6 @@ from score_page import CURVES, SCORES, write_page
 
 from mappo_unity.runs.metrics_csv import read_metrics
 
-EPISODES = 400  # of each evaluation
-MORE_EPISODES = {"WallJump": 2000}  # its areas begin with an episode that is cut short; it must weigh little
 POINTS = 60  # of a curve
 EVALUATION_S = 900  # a policy that stands still in a scene without a time limit would play for ever
 
@@ -42,7 +40,7 @@ def main() -> None:
     parser.add_argument("words", nargs="*", metavar="SCENE|OPTION")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--minutes", type=float, default=120.0, help="of collecting and learning, for a run")
-    parser.add_argument("--episodes", type=int, help="of each evaluation; without it as the page says")
+    parser.add_argument("--episodes", type=int, help="of each evaluation, instead of score_measures'")
     parser.add_argument("--out", type=Path, default=Path("outputs/scores"))
     parser.add_argument("--unity", type=Path, help="folder of Unity's own policies, BEHAVIOR.onnx")
     parser.add_argument("--draw", action="store_true", help="run nothing")
@@ -156,7 +154,7 @@ def score(
                 "sampled": not deterministic,
                 "value": f"{value:.4g}",
                 "stderr": f"{stderr:.2g}",
-                "episodes": episodes_of(arguments, scene),
+                "episodes": arguments.episodes or measure.episodes,
                 **{name: facts.get(name, "") for name in ("decisions", "minutes", "options", "load")},
             }
             append(SCORES, row)
@@ -167,7 +165,7 @@ def evaluate(
     arguments: argparse.Namespace, measure: Measure, player: str, policy: list[str], deterministic: bool
 ) -> dict[str, Any] | None:
     """Return what mappo-eval says of a policy; None where it cannot be measured."""
-    episodes = episodes_of(arguments, measure.scene)
+    episodes = arguments.episodes or measure.episodes
     lines = [*policy, f"episodes={episodes}", f"deterministic={str(deterministic).lower()}"]
     if measure.opponent == "unity":
         if arguments.unity is None or player == "unity":
@@ -186,11 +184,6 @@ def evaluate(
         # what a file lacks (some of Unity's cannot be played without sampling) is one blank, not a run's end
         print(f"{measure.scene}, {player}: not measured with deterministic={deterministic}", flush=True)
     return None
-
-
-def episodes_of(arguments: argparse.Namespace, scene: str) -> int:
-    """Return of how many episodes or matches an evaluation is."""
-    return arguments.episodes or MORE_EPISODES.get(scene, EPISODES)
 
 
 def is_measured(scene: str, player: str) -> bool:
