@@ -264,7 +264,7 @@ def _scratch(schema: type) -> DictConfig:
 
 
 def _unknown(key: str, table: dict[str, Option], groups: dict[str, list[str]]) -> str:
-    if key.split(".")[0] == "search":
+    if key == "search":
         return f"{key} is not an option of this command: mappo-search takes it (mappo-search --help)"
 
     names = [name for name, option in table.items() if not option.is_section] + list(groups)

@@ -52,12 +52,11 @@ class RecentEpisodes:
 
         The first to end are no sample: where success ends an episode, they are those that met it by luck.
         """
-        count = sum(len(rows) for rows in self.recent.values())
-        return self.summary()["return_mean"] if count >= self.size else -math.inf
+        return self.summary()["return_mean"] if len(self._rows()) >= self.size else -math.inf
 
     def standard_error(self) -> float:
         """Return that of the mean return, 0 of no episodes; team mates, who earn the same, count each."""
-        count = sum(len(rows) for rows in self.recent.values())
+        count = len(self._rows())
         return self.summary()["return_std"] / math.sqrt(count) if count else 0.0
 
     def summary(self) -> dict[str, float]:
@@ -65,14 +64,16 @@ class RecentEpisodes:
 
         A return is the individual and the group reward of an agent's episode.
         """
-        everything = [row for rows in self.recent.values() for row in rows]
-        out = _summary("", everything)
+        out = _summary("", self._rows())
 
         if len(self.recent) > 1:
             for behavior, rows in self.recent.items():
                 out |= _summary(f"{behavior}/", list(rows))
 
         return out
+
+    def _rows(self) -> list[tuple[float, float, int]]:
+        return [row for rows in self.recent.values() for row in rows]
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that resuming needs."""
