@@ -39,6 +39,7 @@ VARIANTS = (
     ("2, 2 learners", ["collect.workers=2", "learners=2", "update_threads=1"]),
 )
 QUIET = ["log.loggers=[]", "log.progress=false", "export_onnx=false"]
+QUIET += ["self_play.save_steps=null"]  # a pool costs by its own: scripts/bench_self_play.py
 ENDLESS = ["max_steps=1000000000", "checkpoint_interval=1000000000", "matches.interval=null"]
 
 

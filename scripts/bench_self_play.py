@@ -47,7 +47,7 @@ def main() -> None:
 def measure(scene: str, options: list[str], repeats: int) -> None:
     """Compare both runs of a scene."""
     lines = [f"env={scene}", "update_threads=1", "matches.interval=null", *options]
-    plain = compose_config(lines).config
+    plain = compose_config([*lines, "self_play.save_steps=null"]).config
     pooled = compose_config([*lines, "self_play.save_steps=1", f"self_play.window={POOL}"]).config
 
     with ExitStack() as stack:

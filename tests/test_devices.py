@@ -40,7 +40,10 @@ RUNS = {
     "minibatch": ([*BALL, *BY_PART], 96),
     "curious": ([*BALL, "rewards.curiosity.strength=0.1", "rewards.rnd.strength=0.1"], 96),
     "rollback": ([*BALL, "ppo.max_kl=1e-9"], 96),
-    "SoccerTwos": (["env=SoccerTwos", "env.num_areas=1", "matches.interval=1"], 96),
+    "SoccerTwos": (
+        ["env=SoccerTwos", "env.num_areas=1", "matches.interval=1", "self_play.save_steps=null"],
+        96,
+    ),
     "self-play": (
         [
             *("env=SoccerTwos", "env.num_areas=2", "model.memory=gru", "ppo.sequence_length=4"),

@@ -21,7 +21,7 @@ from mappo_unity.training.collection.batches import Batch
 
 RAY = "collect.engine=ray"
 WITHOUT_END = "max_steps=100000000"
-SOCCER = [*TWO_AREAS, "matches.interval=null"]
+SOCCER = [*TWO_AREAS, "matches.interval=null", "self_play.save_steps=null"]
 
 pytestmark = pytest.mark.slow
 
