@@ -84,6 +84,16 @@ def test_a_resumed_run_is_surveyed_from_there(tmp_path: Path) -> None:
     assert read_survey(tmp_path)["Probe"]["decisions"] == 8192
 
 
+def test_agents_that_an_opponent_plays_are_not_idle(tmp_path: Path) -> None:
+    lines = ["env=SoccerTwos", "env.num_areas=1", "model.hidden=[8]", "matches.interval=null", "ppo.epochs=1"]
+    lines += ["self_play.save_steps=200", "self_play.play_against_latest_model_ratio=0", "max_steps=1400"]
+    lines += ["self_play.team_change=100000", "collect.batch_size=200", f"hydra.run.dir={tmp_path}"]
+    assert train_main(lines) == 0
+
+    slots = read_survey(tmp_path)["SoccerTwos"]["slots"]
+    assert slots == {"all": 2, "idle": 0}, "the two agents of the other team are asked as often"
+
+
 # --- what metrics tell, with numbers made by hand
 
 

@@ -11,9 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fakes import Record, ScriptedEnv
 
 from mappo_unity.cli import doctor_main
 from mappo_unity.cli.doctor import CURES, diagnose, port_state
+from mappo_unity.cli.examine.findings import Report
+from mappo_unity.cli.examine.player import _examine_rhythm
 from mappo_unity.cli.player import run as player_main
 from mappo_unity.config.ranges import check_duration
 from mappo_unity.errors import ConfigError
@@ -77,6 +80,21 @@ def test_a_sick_player_is_told_its_cure(tmp_path: Path, mode: str, after: int, w
     code, text = examine("--file-name", bad_player(tmp_path, mode, after), "--timeout-s", patience_s)
     assert code == 1 and "FAIL" in text
     assert all(part in text for part in words), text
+
+
+@pytest.mark.parametrize(("again", "warnings"), [(False, 1), (True, 0)])
+def test_agents_that_ask_only_once_are_told(again: bool, warnings: int) -> None:
+    lines: list[str] = []
+    report = Report(lines.append)
+    env = ScriptedEnv(
+        [[Record(1), Record(2)], [Record(1, ends="terminated")], [Record(2)] if again else [], []]
+    )
+    env.reset()
+    _examine_rhythm(report, env, steps=3)
+
+    per_step = 1.0 if again else 0.7
+    assert f"{per_step} decisions a step, 1 episodes ended, 1 of 3 steps with ends only" in lines[0]
+    assert report.warnings == warnings and ("second time" in lines[-1]) == (not again)
 
 
 def test_a_player_without_a_log_is_not_said_to_have_one(tmp_path: Path) -> None:

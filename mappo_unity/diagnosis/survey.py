@@ -69,12 +69,16 @@ class PolicySurvey:
         present = rounds.get(keys.PRESENT).flatten(1).cpu().numpy()
         self.facts["decisions"] += int(acting.sum())
 
+        # an opponent's agents are asked, too, but ACTING says nothing of them
+        played = rounds.get(keys.PLAYER, None)
+        ours = present if played is None else present & (played.flatten(1).cpu().numpy() == keys.LEARNER)
+
         # slots may become more while a run goes on
         if self._acted is None or len(self._acted) != acting.shape[1]:
             self._acted = np.zeros(acting.shape[1], int)
             self._there = np.zeros(acting.shape[1], int)
         self._acted += acting.sum(0)
-        self._there += present.sum(0)
+        self._there += ours.sum(0)
         often_there = self._there >= 500
         idle = often_there & (self._acted * 500 <= self._there)
         self.facts["slots"] = {"all": int(often_there.sum()), "idle": int(idle.sum())}

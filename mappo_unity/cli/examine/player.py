@@ -154,7 +154,7 @@ def _actions(spec: Any) -> str:
 
 
 def _examine_rhythm(report: Report, player: Any, steps: int = PATIENCE_STEPS) -> None:
-    decisions = terminals = only_terminals = masked = 0
+    decisions, ends, masked = [], [], 0  # decisions and ends of each step
 
     for _ in range(steps):
         asked = ended = 0
@@ -164,17 +164,18 @@ def _examine_rhythm(report: Report, player: Any, steps: int = PATIENCE_STEPS) ->
             masked += sum(int(mask.sum()) for mask in decision.action_mask or [])
             player.set_actions(name, spec.action_spec.random_action(len(decision)))
 
-        decisions, terminals = decisions + asked, terminals + ended
-        only_terminals += int(not asked and ended > 0)
+        decisions.append(asked)
+        ends.append(ended)
         player.step()
 
-    if decisions:
+    if any(decisions):
+        only_ends = sum(not asked and ended > 0 for asked, ended in zip(decisions, ends, strict=True))
         report.good(
-            f"rhythm, random actions: {decisions / steps:.1f} decisions a step, {terminals} episodes ended, "
-            f"{only_terminals} of {steps} steps with ends only, {masked} actions masked"
+            f"rhythm, random actions: {sum(decisions) / steps:.1f} decisions a step, {sum(ends)} episodes "
+            f"ended, {only_ends} of {steps} steps with ends only, {masked} actions masked"
         )
 
-    if decisions <= sum(len(player.get_steps(name)[0]) for name in player.behavior_specs):
+    if not any(decisions[1:]):
         report.warn("nobody asked a second time", CURES["rhythm"])
 
 
