@@ -49,5 +49,6 @@ def test_a_clone_in_an_environment_of_the_users_takes_pip(
     assert install_command("video") == "pip install --editable '.[video]'"
 
 
-def test_an_installed_package_takes_pip(place: Path) -> None:
-    assert install_command("video") == "pip install 'mappo-unity[video]'"
+def test_an_installed_package_names_what_the_extra_brings(place: Path) -> None:
+    assert install_command("plot") == "pip install 'matplotlib>=3.8'"
+    assert install_command("video") == "pip install 'imageio-ffmpeg>=0.5' 'pillow>=10.1'"

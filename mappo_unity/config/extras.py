@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import shlex
 import sys
@@ -19,7 +20,10 @@ SWEEP_EXTRA = {
 
 
 def install_command(extra: str) -> str:
-    """Return what installs an extra: scripts/setup for a clone's own .venv, pip elsewhere."""
+    """Return what installs an extra: scripts/setup for a clone's own .venv, pip elsewhere.
+
+    Of a package installed by pip it names the extra's packages.
+    """
     # short where the user stands at the top of the clone, else with the whole path
     is_here = Path.cwd() == ROOT
     setup = ROOT / "scripts" / "setup"
@@ -31,4 +35,17 @@ def install_command(extra: str) -> str:
         place = "." if is_here else str(ROOT)
         return f"pip install --editable {shlex.quote(f'{place}[{extra}]')}"
 
-    return f"pip install 'mappo-unity[{extra}]'"
+    # by the packages' names: the package itself may have come from a folder that is gone
+    return "pip install " + " ".join(shlex.quote(package) for package in _packages(extra))
+
+
+def _packages(extra: str) -> list[str]:
+    """Return what an extra brings, such as ``["matplotlib>=3.8"]``, as the installed package says."""
+    try:
+        requirements = importlib.metadata.requires("mappo-unity") or []
+    except importlib.metadata.PackageNotFoundError:  # copied, not installed
+        return [f"mappo-unity[{extra}]"]
+
+    halves = [requirement.partition(";") for requirement in requirements]
+    wanted = {f"extra == '{extra}'", f'extra == "{extra}"'}
+    return [package.strip() for package, _, marker in halves if marker.strip() in wanted]
