@@ -18,7 +18,7 @@ from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[1]
 INDEX = "docs/README.md"
-SCHEMA = "mappo_unity/config/schema.py"
+SCHEMA = "mappo_unity/config/schema"
 GENERATED = {"options.md": "Every option", "commands.md": "Every command"}
 _LINK = re.compile(r"(?<=\]\()([^)\s#]+)(?=[)#])")
 _BULLET_LINK = re.compile(r"\[([^\]]+)\]\(([^)\s]+)\)")

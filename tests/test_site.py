@@ -55,7 +55,7 @@ def test_headings_and_long_bullets_are_sections() -> None:
         ("docs/demonstrations.md", "../examples/custom_env.py", "project/examples/custom_env.py.md"),
         ("docs/scenes/README.md", "../export.md", "../export.md"),
         ("docs/export.md", "../README.md", "index.md"),
-        ("docs/concepts.md", "../mappo_unity/config/schema.py", "options.md"),
+        ("docs/concepts.md", "../mappo_unity/config/schema/", "options.md"),
         ("README.md", "docs/export.md", "export.md"),
         ("CONTRIBUTING.md", "docs/export.md", "../export.md"),
         ("docs/export.md", "no-such-file.md", "no-such-file.md"),

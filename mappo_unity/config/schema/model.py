@@ -1,0 +1,149 @@
+"""Options of the networks: `model.*`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Optional
+
+from mappo_unity.config.schema.checks import at_least, widths, within
+from mappo_unity.errors import ConfigError
+
+
+class Activation(Enum):
+    """Nonlinearity between hidden layers."""
+
+    tanh = "tanh"
+    relu = "relu"
+    silu = "silu"
+    elu = "elu"
+
+
+class CriticKind(Enum):
+    """What the critic of an agent sees."""
+
+    local = "local"
+    central = "central"
+    mean = "mean"
+    attention = "attention"
+    poca = "poca"
+
+
+class MemoryKind(Enum):
+    """The memory of a network."""
+
+    none = "none"
+    lstm = "lstm"
+    gru = "gru"
+
+
+class ImageKind(Enum):
+    """Layers between an image and its features."""
+
+    auto = "auto"
+    simple = "simple"
+    nature = "nature"
+    resnet = "resnet"
+    match3 = "match3"
+    dense = "dense"
+
+
+class GoalKind(Enum):
+    """How goal signals reach a network."""
+
+    none = "none"
+    hyper = "hyper"
+
+
+class WeightInit(Enum):
+    """Initial weights of linear layers; biases are 0."""
+
+    orthogonal = "orthogonal"
+    kaiming_normal = "kaiming_normal"
+
+
+class DistributionKind(Enum):
+    """Distribution of continuous actions."""
+
+    gaussian = "gaussian"
+    tanh_normal = "tanh_normal"
+
+
+LOG_STD_RANGE = (-5, 2)
+"""Of the logarithm of the standard deviation of continuous actions, before the division by 3."""
+
+
+def bounded_log_std(value: float) -> float:
+    """Return the value in `LOG_STD_RANGE` of the same effect as an older run's, which might lie beyond."""
+    return min(max(value, LOG_STD_RANGE[0]), LOG_STD_RANGE[1])
+
+
+@dataclass
+class ModelConfig:
+    """The actor's and the critic's networks."""
+
+    hidden: list[int] = field(default_factory=lambda: [128, 128])
+    """Widths of the hidden layers."""
+    critic_hidden: Optional[list[int]] = None
+    """Widths of the critic's hidden layers; null: as model.hidden."""
+    activation: Activation = Activation.tanh
+    """Nonlinearity between hidden layers."""
+    critic: CriticKind = CriticKind.central
+    """What an agent's critic sees: its own observation (local: IPPO), its team's concatenated (central:
+    MAPPO), or its team's pooled (mean, attention: for teams whose size varies). poca: MA-POCA's value of the
+    team, and a baseline for each member that knows its mates' actions."""
+    share_parameters: bool = True
+    """One network for all members of a team; false: one for each member."""
+    flatten_branches: bool = False
+    """One categorical over all combinations of the discrete branches, instead of one for each branch."""
+    normalize_obs: bool = True
+    """Normalise observations by running mean and variance, inside the network."""
+    obs_norm_prior: bool = False
+    """Let the running mean and variance of observations begin with one pseudo-observation of mean 0 and
+    variance 1, as ML-Agents does, instead of with nothing."""
+    layer_norm: bool = False
+    """Layer normalisation of vector observations and after each hidden activation, as in the MAPPO paper."""
+    weight_init: WeightInit = WeightInit.orthogonal
+    """Initial weights: orthogonal with gain sqrt 2, output layers 0.01 (orthogonal), or ML-Agents' He normal
+    with gain 1, means 0.2, branches 0.1, a value layer Xavier uniform (kaiming_normal)."""
+    action_distribution: DistributionKind = DistributionKind.gaussian
+    """Continuous actions: a Gaussian that the environment clips, its deviation a weight of its own
+    (gaussian), or a Gaussian squashed by tanh, its deviation an output of the network (tanh_normal)."""
+    image_encoder: ImageKind = ImageKind.auto
+    """Encoder of images and grids: ML-Agents' simple (from 20 x 20 on), nature (36), resnet (15), match3 (5)
+    or dense (any size), with as many features as the first hidden layer is wide; auto: convolutions that fit
+    the size, 128 features."""
+    goal_conditioning: GoalKind = GoalKind.none
+    """Sensors that are goal signals: observations like others (none), and, as ML-Agents' default has it, what
+    another network makes the weights of the last hidden layer of (hyper; actors and local critics)."""
+    memory: MemoryKind = MemoryKind.none
+    """Memory of the actor and the critic: lstm or gru, one layer before the heads; none: they see the newest
+    observation only."""
+    memory_size: int = 128
+    """Width of the memory's state (as in ML-Agents: an LSTM's hidden and cell state are half as wide)."""
+    init_log_std: float = 0.0
+    """Logarithm of the initial standard deviation of continuous actions (before the division by 3; with
+    tanh_normal before tanh), from -5 to 2, where training keeps it."""
+
+    def __post_init__(self) -> None:
+        widths("model.hidden", self.hidden)
+        widths("model.critic_hidden", self.critic_hidden or [1])  # null and [] mean model.hidden
+
+        at_least("model.memory_size", self.memory_size, 1)
+        if self.memory is MemoryKind.lstm and self.memory_size % 2:
+            raise ConfigError(
+                f"model.memory_size={self.memory_size} must be even with model.memory=lstm: half of it is "
+                f"the hidden state, half the cell state; model.memory_size={self.memory_size + 1}"
+            )
+        if self.memory is not MemoryKind.none and not self.share_parameters:
+            raise ConfigError(
+                f"model.memory={self.memory.value} needs model.share_parameters=true: networks of each "
+                "member of a team have no memory yet"
+            )
+
+        if self.critic is CriticKind.poca and not self.share_parameters:
+            raise ConfigError(
+                "model.critic=poca needs model.share_parameters=true: its value is the whole team's"
+            )
+
+        within("model.init_log_std", self.init_log_std, *LOG_STD_RANGE)
