@@ -1,4 +1,4 @@
-"""The page that scripts/score_table.py writes: docs/benchmarks/scores.md and a picture of each scene."""
+"""What scripts/score_table.py writes: docs/benchmarks/scores.md, a picture of each scene, README's table."""
 
 from __future__ import annotations
 
@@ -6,19 +6,26 @@ import math
 import statistics
 import textwrap
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from learn_scene import read_rows
 from score_measures import MEASURES, Measure
 
-BENCHMARKS = Path(__file__).resolve().parents[1] / "docs/benchmarks"
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+BENCHMARKS = ROOT / "docs/benchmarks"
 SCORES = BENCHMARKS / "scores.csv"
 CURVES = BENCHMARKS / "score_curves.csv"
 PAGE = BENCHMARKS / "scores.md"
 PICTURES = BENCHMARKS / "scores"
 FIXED = "random", "unity"
 KEPT_ASIDE = "3"  # the seed that is not looked at while presets are chosen
+BEGIN, END = "<!-- scores -->\n", "<!-- end of scores -->\n"  # around README's table
+
+Point = tuple[float, float, float]
+"""Decisions, minutes, value."""
 
 HEAD = """\
 # Scores
@@ -39,8 +46,7 @@ def write_page() -> None:
     """Write the page, and the pictures where matplotlib is there."""
     rows = read_rows(SCORES)
     names = "scene", "measure", "target", "ours", "kept aside", "Unity's policy", "random", "reached after"
-    lines = [HEAD, f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
-    lines += [table_row(measure, rows) for measure in MEASURES if of(measure, rows)]
+    lines = [HEAD, *table(names, table_row, rows)]
 
     missing = [measure.scene for measure in MEASURES if not of(measure, rows)]
     if missing:
@@ -49,6 +55,15 @@ def write_page() -> None:
     drawn = draw_curves()
     lines += [f"\n![Return of {scene} against decisions and minutes](scores/{scene}.png)" for scene in drawn]
     PAGE.write_text("\n".join(lines) + "\n")
+    README.write_text(with_summary(README.read_text()))
+
+
+def table(
+    names: Sequence[str], row_of: Callable[[Measure, list[dict[str, str]]], str], rows: list[dict[str, str]]
+) -> list[str]:
+    """Return the lines of a table with a row for each measure that has been taken."""
+    lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+    return lines + [row_of(measure, own) for measure in MEASURES if (own := of(measure, rows))]
 
 
 def of(measure: Measure, rows: list[dict[str, str]]) -> list[dict[str, str]]:
@@ -56,16 +71,24 @@ def of(measure: Measure, rows: list[dict[str, str]]) -> list[dict[str, str]]:
     return [row for row in rows if (row["scene"], row["measure"]) == (measure.scene, measure.name)]
 
 
+def is_tuned_on(row: dict[str, str]) -> bool:
+    """Return whether a row is of one of the seeds that were looked at while presets were chosen."""
+    return row["policy"] not in {KEPT_ASIDE, *FIXED}
+
+
+def target_of(measure: Measure) -> str:
+    """Return the target as ``>= 0.93``."""
+    return f"{'<=' if measure.is_lower_better else '>='} {measure.target:g}"
+
+
 def table_row(measure: Measure, rows: list[dict[str, str]]) -> str:
-    """Return the row of the table that compares a measure's policies."""
-    own = of(measure, rows)
-    others = {KEPT_ASIDE, *FIXED}
-    seeds = sorted((row for row in own if row["policy"] not in others), key=lambda row: int(row["policy"]))
+    """Return a measure's row of the page's table, which compares policies."""
+    seeds = sorted(filter(is_tuned_on, rows), key=lambda row: int(row["policy"]))
     columns = KEPT_ASIDE, "unity", "random"
     cells = [
-        *(measure.scene, measure.name, f"{'<=' if measure.is_lower_better else '>='} {measure.target:g}"),
+        *(measure.scene, measure.name, target_of(measure)),
         both_ways(seeds),
-        *(both_ways([row for row in own if row["policy"] == player]) for player in columns),
+        *(both_ways([row for row in rows if row["policy"] == player]) for player in columns),
         reached_after(measure),
     ]
     return f"| {' | '.join(cells)} |"
@@ -85,19 +108,48 @@ def both_ways(rows: list[dict[str, str]]) -> str:
 
 def reached_after(measure: Measure) -> str:
     """Return the decisions and minutes after which each seed's curve stood at the target first."""
+    return "; ".join(f"{point[0] / 1e6:.2f} M, {point[1]:.1f} min" for point in first_reached(measure)) or "-"
+
+
+def first_reached(measure: Measure) -> list[Point]:
+    """Return where the curve of each seed stood at the target first, of the seeds that did."""
     if measure.opponent == "unity":  # no run plays against it while it learns
-        return "-"
+        return []
 
-    reached = []
-    for points in curves_of(measure.scene, measure.column).values():
-        first = next((point for point in points if measure.is_reached(point[2])), None)
-        if first is not None:
-            reached.append(f"{first[0] / 1e6:.2f} M, {first[1]:.1f} min")
-    return "; ".join(reached) or "-"
+    curves = curves_of(measure.scene, measure.column).values()
+    wholes = ([point for point in curve if point[0] >= measure.counts_from] for curve in curves)
+    reached = [[point for point in curve if measure.is_reached(point[2])] for curve in wholes]
+    return [points[0] for points in reached if points]
 
 
-Point = tuple[float, float, float]
-"""Decisions, minutes, value."""
+def with_summary(readme: str) -> str:
+    """Return README with today's table: the mean over seeds beside random play and Unity's policy."""
+    head, _, rest = readme.partition(BEGIN)
+    _, _, tail = rest.partition(END)
+
+    names = "scene", "measure", "random", "preset", "Unity's policy", "target", "target first reached after"
+    lines = table(names, summary_row, read_rows(SCORES))
+    return head + BEGIN + "\n".join(lines) + "\n" + END + tail
+
+
+def summary_row(measure: Measure, rows: list[dict[str, str]]) -> str:
+    """Return a measure's row of README's table."""
+    sampled = [row for row in rows if row["sampled"] == "True"]
+    seeds = [float(row["value"]) for row in sampled if is_tuned_on(row)]
+    values = {row["policy"]: float(row["value"]) for row in sampled}
+    ours = f"**{statistics.mean(seeds):.3g}**" + (f" (of {len(seeds)})" if len(seeds) < 3 else "")
+    random, unity = (f"{values[player]:.3g}" if player in values else "-" for player in FIXED)
+
+    # the seed in the middle, of those that came there
+    firsts = sorted(first_reached(measure), key=lambda point: point[1])
+    when = "-"
+    if firsts:
+        decisions, minutes, _ = firsts[(len(firsts) - 1) // 2]
+        when = f"{decisions / 1e6:.2f} M decisions, {minutes:.1f} min"
+        when += "" if len(firsts) == len(seeds) else f" ({len(firsts)} of {len(seeds)} seeds)"
+
+    scene = f"[{measure.scene}](docs/scenes/{measure.scene}.md)"
+    return f"| {scene} | {measure.name} | {random} | {ours} | {unity} | {target_of(measure)} | {when} |"
 
 
 def curves_of(scene: str, column: str) -> dict[str, list[Point]]:

@@ -1,0 +1,77 @@
+"""The tables that scripts/score_table.py writes: what stands in README is what was measured."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+
+import score_page
+from score_measures import MEASURES, Measure, mean_return
+
+
+def test_the_table_in_readme_is_that_of_the_measured_scores() -> None:
+    readme = score_page.README.read_text(encoding="utf-8")
+    assert score_page.with_summary(readme) == readme, "python scripts/score_table.py --draw writes it anew"
+
+
+def test_every_scene_with_a_target_has_a_row() -> None:
+    readme = score_page.README.read_text(encoding="utf-8")
+    table = readme.partition(score_page.BEGIN)[2].partition(score_page.END)[0].splitlines()[2:]
+    assert [row.split(" | ")[1] for row in table] == [measure.name for measure in MEASURES]
+
+
+@pytest.fixture
+def curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write curves of two seeds and of the one kept aside: decisions, minutes, value."""
+    rows: list[dict[str, Any]] = []
+    for seed, points in {
+        "0": [(100, 1.0, 0.9), (200, 2.0, 0.3), (300, 3.0, 0.8)],
+        "1": [(100, 1.5, 0.1), (400, 4.0, 0.4)],
+        "3": [(100, 1.0, 1.0), (300, 3.0, 1.0)],
+    }.items():
+        for decisions, minutes, value in points:
+            rows.append(
+                {"scene": "Probe", "column": "return_mean", "seed": seed, "decisions": decisions}
+                | {"minutes": minutes, "value": value}
+            )
+
+    path = tmp_path / "curves.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    monkeypatch.setattr(score_page, "CURVES", path)
+
+
+@pytest.mark.parametrize(
+    ("counts_from", "is_lower_better", "expected"),
+    [
+        (0, False, [(100.0, 1.0, 0.9)]),
+        (200, False, [(300.0, 3.0, 0.8)]),  # before, the task was an easier one
+        (400, False, []),
+        (0, True, [(200.0, 2.0, 0.3), (100.0, 1.5, 0.1)]),
+    ],
+)
+def test_a_target_is_reached_where_the_curve_first_stands_there(
+    counts_from: int, is_lower_better: bool, expected: list[tuple[float, float, float]], curves: None
+) -> None:
+    measure = Measure(
+        "Probe", "return", mean_return, 0.5, is_lower_better=is_lower_better, counts_from=counts_from
+    )
+    assert score_page.first_reached(measure) == expected
+
+
+def test_a_row_says_how_many_seeds_there_are(curves: None) -> None:
+    def row(policy: str, value: float, sampled: str = "True") -> dict[str, str]:
+        return {"policy": policy, "value": str(value), "sampled": sampled}
+
+    rows = [row("0", 0.8), row("0", 0.2, "False"), row("1", 0.4), row("3", 1.0), row("random", -1.0)]
+    cells = score_page.summary_row(Measure("Probe", "return", mean_return, 0.5), rows).split(" | ")
+    assert cells[1:-1] == ["return", "-1", "**0.6** (of 2)", "-", ">= 0.5"]
+    assert cells[-1].startswith("0.00 M decisions, 1.0 min (1 of 2 seeds)")
