@@ -52,7 +52,7 @@ IN_THE_OPTIONS = {
     "entropy_high": ("entropy stays", ["ppo.entropy_coef=10", "ppo.entropy_schedule=constant"]),
     "collapse": (
         "entropy collapsed",
-        # the rate leaves no doubt: with a tenth of it the entropy ends on either side of the limit, by rounding
+        # no doubt at this rate: at a tenth of it rounding decides on which side of the limit the entropy ends
         ["ppo.lr=0.3", "ppo.max_kl=1e9", "ppo.epochs=20", "ppo.clip_epsilon=0.9", "env.params.fault=noise"],
     ),
     "epochs": (

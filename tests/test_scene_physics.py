@@ -49,21 +49,6 @@ def test_arrays_inputs_and_free_fall(per_model: int) -> None:
     assert physics.qvel[:, 6] == pytest.approx(np.arange(7) / 4 * 0.04)  # F / m * t
     assert physics.qvel[2, 0] == pytest.approx(6 / 2 * 0.04) and physics.qvel[1, 0] == 0
     assert physics.sensordata[0, 1] == pytest.approx(3 - 0.01 * (0.1 + 0.2 + 0.3))  # before the last substep
-    heights = physics.substep_sensors()[:, :, 1]
-    assert heights.shape == (7, 4)
-    assert heights[0].tolist() == pytest.approx([3, 3 - 0.01 * 0.1, 3 - 0.01 * 0.3, 3 - 0.01 * 0.6])
-
-
-def test_some_areas_may_take_steps_of_another_length() -> None:
-    physics = areas(5)
-    physics.step(num_substeps=4, areas=np.array([1, 3]), timestep=0.02)
-    physics.step(num_substeps=4, areas=np.array([0]))
-    assert physics.qvel[:, 1] == pytest.approx([-0.4, -0.8, 0, -0.8, 0])  # 4 * 0.01 s * 10, 4 * 0.02 s * 10
-    assert physics.substep_sensors().shape == (1, 4, 3)
-
-    physics.set_gravity(5.0)  # of every length
-    physics.step(num_substeps=4, areas=np.array([1]), timestep=0.02)
-    assert physics.qvel[1, 1] == pytest.approx(-1.2)
 
 
 @pytest.mark.parametrize("per_model", [1, 3])

@@ -52,7 +52,6 @@ class AreaPhysics:
         shared = self.model if self._per_model == 1 else _repeated(area, self.model, self._per_model)
         self._models = [shared] * num_models
         self._shared = shared
-        self._by_timestep = {shared.opt.timestep: shared}
 
         self._data = [mujoco.MjData(shared) for _ in range(num_threads)]
         self._scratch = mujoco.MjData(shared)
@@ -60,36 +59,25 @@ class AreaPhysics:
         self._num_areas = num_areas
         self._allocate()
 
-    def step(
-        self, num_substeps: int = 1, areas: np.ndarray | None = None, timestep: float | None = None
-    ) -> None:
-        """Advance areas by `num_substeps` MuJoCo steps with constant inputs.
-
-        Args:
-            num_substeps: how many.
-            areas: integers [n] of those that move, the others sleep (with one area a model only); None: all.
-            timestep: s, of these steps, for areas without constants of their own; None: the model's.
+    def step(self, num_substeps: int = 1) -> None:
+        """Advance all areas by `num_substeps` MuJoCo steps with constant inputs.
 
         Raises:
             FloatingPointError: an area's state has become infinite or NaN (names the first).
         """
-        assert areas is None or self._per_model == 1, "areas that share a model step together"
-        rows: slice | np.ndarray = slice(None) if areas is None else areas
-        models = self._chosen(areas, timestep)
-        num_models, per_area = len(models), (len(models) * self._per_model, -1)
+        num_models, per_area = len(self._models), (len(self._models) * self._per_model, -1)
 
         # Positions, velocities and inputs into MuJoCo's own rows: clock, positions, velocities, the rest.
-        state = self._state[rows]  # of all areas: a view, to be changed in place; of some: a copy
-        state[:, 1 : 1 + self._nq] = self._qpos[rows].reshape(num_models, -1)
-        state[:, 1 + self._nq : 1 + self._nq + self._nv] = self._qvel[rows].reshape(num_models, -1)
-        control, out, sensors = (buffer[:num_models] for buffer in self._buffers(num_substeps))
+        self._state[:, 1 : 1 + self._nq] = self._qpos.reshape(num_models, -1)
+        self._state[:, 1 + self._nq : 1 + self._nq + self._nv] = self._qvel.reshape(num_models, -1)
+        control, out, sensors = self._buffers(num_substeps)
         for columns, values in self._inputs:
-            control[:, :, columns] = values[rows].reshape(num_models, 1, -1)
+            control[:, :, columns] = values.reshape(num_models, 1, -1)
 
         self._rollout.rollout(
-            models,
+            self._models,
             self._data,
-            state,
+            self._state,
             control,
             skip_checks=True,
             nstep=num_substeps,
@@ -99,27 +87,13 @@ class AreaPhysics:
         )
 
         last = out[:, -1]
-        self._state[rows, 1:] = last[:, 1:]  # the clock stays 0: nothing may depend on it
-        self._qpos[rows] = last[:, 1 : 1 + self._nq].reshape(per_area)
-        self._qvel[rows] = last[:, 1 + self._nq : 1 + self._nq + self._nv].reshape(per_area)
+        self._state[:, 1:] = last[:, 1:]  # the clock stays 0: nothing may depend on it
+        self._qpos[:] = last[:, 1 : 1 + self._nq].reshape(per_area)
+        self._qvel[:] = last[:, 1 + self._nq : 1 + self._nq + self._nv].reshape(per_area)
         if sensors.shape[2]:
-            self._sensordata[rows] = sensors[:, -1].reshape(per_area)
-            self._last_sensors = sensors
+            self._sensordata[:] = sensors[:, -1].reshape(per_area)
 
-        # One sum is enough to find a bad number: NaN and infinity never vanish from it.
-        if not np.isfinite(self._qvel[rows].sum()):
-            area = int(np.flatnonzero(~np.isfinite(self._qvel).all(axis=1))[0])
-            raise FloatingPointError(f"physics of area {area} is not finite any more")
-
-    def substep_sensors(self) -> np.ndarray:
-        """Return the sensors in every substep of the last `step`, float64 [areas, substeps, nsensordata].
-
-        Each as MuJoCo has it, of the poses before the substep's motion: what came and went shows here.
-        """
-        models, substeps, _ = self._last_sensors.shape
-        by_area = self._last_sensors.reshape(models, substeps, self._per_model, -1)
-        areas = by_area.swapaxes(1, 2).reshape(models * self._per_model, substeps, -1)
-        return areas[: self._num_areas]
+        check_finite(self._qvel, np.arange(len(self._qvel)))
 
     def own_model(self, area: int) -> tuple[mujoco.MjModel, str]:
         """Return the model of an area, not shared with other models, and the prefix of the area's names.
@@ -140,7 +114,7 @@ class AreaPhysics:
 
     def set_gravity(self, gravity: float) -> None:
         """Set the downward (-y) acceleration of all areas, m/s^2."""
-        for model in {id(m): m for m in (*self._models, *self._by_timestep.values())}.values():
+        for model in {id(m): m for m in self._models}.values():
             model.opt.gravity[:] = (0.0, -gravity, 0.0)
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -153,15 +127,6 @@ class AreaPhysics:
         arrays = {"qpos": self._qpos, "qvel": self._qvel, "sensordata": self._sensordata, "rest": self._state}
         for name, array in {**arrays, **self._input_arrays}.items():
             array[...] = state[name]
-
-    def _chosen(self, areas: np.ndarray | None, timestep: float | None) -> list[mujoco.MjModel]:
-        """Return the models of areas (None: of all), or the common one with another timestep."""
-        if timestep is None:
-            return self._models if areas is None else [self._models[area] for area in areas.tolist()]
-        if timestep not in self._by_timestep:
-            model = self._by_timestep[timestep] = copy.copy(self._shared)
-            model.opt.timestep = timestep
-        return [self._by_timestep[timestep]] * len(self._models if areas is None else areas)
 
     def _allocate(self) -> None:
         """Create the arrays by area; idle areas of the last model stand at the end, out of sight."""
@@ -200,7 +165,6 @@ class AreaPhysics:
                 self._inputs.append((slice(start, start + size), self._input_arrays[name]))
                 start += size
 
-        self._last_sensors = np.zeros((len(self._models), 1, self._shared.nsensordata))
         self._by_substeps: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def _buffers(self, num_substeps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -212,6 +176,14 @@ class AreaPhysics:
                 np.zeros((num_models, num_substeps, self._shared.nsensordata)),
             )
         return self._by_substeps[num_substeps]
+
+
+def check_finite(velocity: np.ndarray, areas: np.ndarray) -> None:
+    """Raise FloatingPointError where a velocity [n, nv] of `areas` [n] is not finite; name the first."""
+    # One sum is enough to find a bad number: NaN and infinity never vanish from it.
+    if not np.isfinite(velocity.sum()):
+        area = int(areas[np.flatnonzero(~np.isfinite(velocity).all(axis=1))[0]])
+        raise FloatingPointError(f"physics of area {area} is not finite any more")
 
 
 def _repeated(area: mujoco.MjSpec, one: mujoco.MjModel, count: int) -> mujoco.MjModel:

@@ -3,7 +3,7 @@
 Each area's pile is in one of four modes: absent; falling, along a recording made once (a pile that falls
 untouched always falls alike); asleep, at rest; awake, stepped by MuJoCo together with its area's agent. It
 wakes when the agent or a turning switch may reach a cube, and sleeps when all cubes are at rest and out of
-reach. Only awake piles cost anything.
+reach. Only awake piles cost anything, and of those only the cubes that move: each sleeps by itself.
 Legend: N areas, B = 26 bodies (25 bricks, then the goal).
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.scenes.core.ground import CONTACT_GAP, TICK_S
-from mappo_unity.scenes.core.physics import AreaPhysics
+from mappo_unity.scenes.core.sleeping import SleepingPhysics
 from mappo_unity.scenes.pyramids.area import area_spec
 from mappo_unity.scenes.pyramids.layout import BRICKS, GOAL, INNER_WALLS, SPAWN_Y
 
@@ -45,7 +45,7 @@ class PyramidsBricks:
     """
 
     def __init__(self, num_areas: int, num_threads: int = 1) -> None:
-        self._physics = AreaPhysics(area_spec(SUBSTEPS), num_areas, num_threads=num_threads)
+        self._physics = _physics(num_areas, num_threads)
         start = _AGENT_JOINTS
         self.bodies = self._physics.qpos[:, start:].reshape(num_areas, NUM_BODIES, 7)  # x y z, w x y z
         self._speeds = self._physics.qvel[:, start:].reshape(num_areas, NUM_BODIES, 6)
@@ -57,13 +57,13 @@ class PyramidsBricks:
     @cached_property
     def _fall(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the recording of a fall at the origin: poses [T, B, 7] and velocities [T, B, 6]."""
-        alone = AreaPhysics(area_spec(SUBSTEPS), 1)
+        alone = _physics(1, num_threads=1)
         poses, speeds = [], []
         alone.qpos[0, :2] = 40.0  # the agent, far away
         alone.qpos[0, _AGENT_JOINTS:] = _spawned().ravel()
 
         for _ in range(FALL_TICKS):
-            alone.step(SUBSTEPS)
+            alone.step(SUBSTEPS, np.zeros(1, int), TICK_S / SUBSTEPS)
             poses.append(alone.qpos[0, _AGENT_JOINTS:].reshape(NUM_BODIES, 7).copy())
             speeds.append(alone.qvel[0, _AGENT_JOINTS:].reshape(NUM_BODIES, 6).copy())
 
@@ -81,6 +81,7 @@ class PyramidsBricks:
         self.bodies[areas, :, 2] += root[:, 1:]
 
         self._speeds[areas] = 0.0
+        self._physics.wake(areas)
         self.root[areas] = root
         self.clock[areas] = 0
 
@@ -103,6 +104,9 @@ class PyramidsBricks:
         still = np.flatnonzero((self.mode == FALLING) | (self.mode == ASLEEP))
         if still.size:
             self.mode[still[self._in_reach(still, position, velocity, switch_position, switch_spin)]] = AWAKE
+
+        # a switch is no body that wakes those that it touches
+        self._physics.wake(np.flatnonzero((self.mode == AWAKE) & (switch_spin != 0)))
         return self.mode == AWAKE
 
     def step(
@@ -139,9 +143,8 @@ class PyramidsBricks:
         calm = self._calm(areas, position, velocity)
         for some, substeps in ((areas[calm], CALM_SUBSTEPS), (areas[~calm], SUBSTEPS)):
             if some.size:
-                physics.step(substeps, some, TICK_S / substeps)
-                # the goal may be thrown clear in the tick
-                goal[some] = physics.substep_sensors()[:, :, 0].min(axis=1) < CONTACT_GAP
+                gaps = physics.step(substeps, some, TICK_S / substeps)[:, :, 0]
+                goal[some] = gaps.min(axis=1) < CONTACT_GAP  # it may be thrown clear in the tick
 
         # the pile may have slowed the agents down
         position[areas, 0], position[areas, 2] = physics.qpos[areas, 0], physics.qpos[areas, 1]
@@ -172,6 +175,7 @@ class PyramidsBricks:
 
             # speeds too: a pile may wake in the middle of its fall
             self._speeds[areas] = speeds[tick]
+            self._physics.wake(areas)
             self.clock[areas] += 1
             self._sleep(areas[tick + 1 == FALL_TICKS])
 
@@ -219,6 +223,11 @@ class PyramidsBricks:
         spin = self._speeds[areas, :, 3:] * SPIN_KEPT
         rate = np.sqrt((spin**2).sum(axis=2, keepdims=True))
         self._speeds[areas, :, 3:] = spin * (MAX_SPIN / np.maximum(rate, MAX_SPIN))
+
+
+def _physics(num_areas: int, num_threads: int) -> SleepingPhysics:
+    """Return the physics of piles; a cube rests as a pile does."""
+    return SleepingPhysics(area_spec(SUBSTEPS), num_areas, tolerance=REST_SPEED, num_threads=num_threads)
 
 
 def _spawned() -> np.ndarray:
