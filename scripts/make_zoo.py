@@ -4,7 +4,7 @@
 Exports the best checkpoint of every RUN to mappo_unity/zoo/BEHAVIOR.onnx, in place of an older one, plays
 what was written, and rewrites zoo.csv and README.md there: how each was trained, what it earns.
 
-    python scripts/make_zoo.py RUN ... [--episodes 400]
+    python scripts/make_zoo.py RUN ... [--episodes N]
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from learn_scene import mappo_eval, read_rows
+from score_measures import measures_of
 
 from mappo_unity.config.compose import load_config
 from mappo_unity.policies.export import export_checkpoint
@@ -31,8 +32,9 @@ HEAD = """\
 Small trained policies, one ONNX file a behavior, that come with the package: `policy=zoo`,
 `run=zoo` and `opponent=zoo` play them, and Unity loads them. All were trained by this project in
 its embedded scenes with the preset of the scene and the options in the table, and are under its
-license. *Earns* is what the file itself earned in 400 episodes as `mappo-eval run=zoo env=SCENE`
-plays it (two-sided scenes: share won of the decided matches against a random side).
+license. *Earns* is what the file itself earned in 400 episodes (WallJump: 2,000) as
+`mappo-eval run=zoo env=SCENE` plays it (two-sided scenes: share won of the decided matches against
+a random side).
 
 Written by `scripts/make_zoo.py`: change nothing here by hand.
 
@@ -47,7 +49,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN")
-    parser.add_argument("--episodes", type=int, default=400)
+    parser.add_argument("--episodes", type=int, help="instead of the score table's")
     arguments = parser.parse_args()
 
     cards = {card["behavior"]: card for card in read_rows(CARDS)}
@@ -56,7 +58,7 @@ def main() -> None:
         write(sorted(cards.values(), key=lambda card: (card["scene"], card["behavior"])))
 
 
-def add(run: Path, episodes: int) -> list[dict[str, Any]]:
+def add(run: Path, episodes: int | None) -> list[dict[str, Any]]:
     """Put the policies of a run into the zoo; return their cards."""
     config = load_config(run / "config.yaml")
     exported = export_checkpoint(choose_checkpoint(run), ZOO_FOLDER)
@@ -66,6 +68,7 @@ def add(run: Path, episodes: int) -> list[dict[str, Any]]:
             raise SystemExit(f"{policy} has {size:,} bytes: at most {LARGEST_BYTES:,}")
 
     scene = str(config.env.name)
+    episodes = episodes or measures_of(scene)[0].episodes
     said = mappo_eval(f"run={ZOO}", f"env={scene}", f"episodes={episodes}", *opponent(run))
     return [
         {

@@ -24,7 +24,6 @@ class Measure:
         opponent: None, "random" or "unity".
         is_lower_better: for times.
         episodes: or matches, that the figure is of.
-        counts_from: decisions of training from which on its curve is one of the whole task.
     """
 
     scene: str
@@ -35,7 +34,6 @@ class Measure:
     opponent: str | None = None
     is_lower_better: bool = False
     episodes: int = 400
-    counts_from: int = 0
 
     def is_reached(self, value: float) -> bool:
         """Return whether a value meets the target."""
@@ -77,17 +75,14 @@ MEASURES = (
     Measure("3DBall", "return", mean_return, 99.5),
     Measure("Basic", "return", mean_return, 0.93),
     Measure("Hallway", "return", mean_return, 0.92),
-    # The first episodes of its areas are harder than what follows; of many episodes they weigh little. Walls
-    # are lower in the first half of the preset's 8 M decisions.
+    # The first episodes of its areas are harder than what follows; of many episodes they weigh little.
     Measure(
         *("WallJump", "SmallWallJump", behavior_return("Small"), 0.94, "SmallWallJump?team=0/return_mean"),
         episodes=2000,
-        counts_from=4_000_000,
     ),
     Measure(
         *("WallJump", "BigWallJump", behavior_return("Big"), 0.86, "BigWallJump?team=0/return_mean"),
         episodes=2000,
-        counts_from=4_000_000,
     ),
     Measure("Pyramids", "return", mean_return, 1.78),
     Measure("PushBlock", "return", mean_return, 4.7),

@@ -117,8 +117,7 @@ def first_reached(measure: Measure) -> list[Point]:
         return []
 
     curves = curves_of(measure.scene, measure.column).values()
-    wholes = ([point for point in curve if point[0] >= measure.counts_from] for curve in curves)
-    reached = [[point for point in curve if measure.is_reached(point[2])] for curve in wholes]
+    reached = [[point for point in curve if measure.is_reached(point[2])] for curve in curves]
     return [points[0] for points in reached if points]
 
 

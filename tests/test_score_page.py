@@ -50,20 +50,17 @@ def curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("counts_from", "is_lower_better", "expected"),
+    ("target", "is_lower_better", "expected"),
     [
-        (0, False, [(100.0, 1.0, 0.9)]),
-        (200, False, [(300.0, 3.0, 0.8)]),  # before, the task was an easier one
-        (400, False, []),
-        (0, True, [(200.0, 2.0, 0.3), (100.0, 1.5, 0.1)]),
+        (0.5, False, [(100.0, 1.0, 0.9)]),
+        (0.95, False, []),
+        (0.5, True, [(200.0, 2.0, 0.3), (100.0, 1.5, 0.1)]),
     ],
 )
 def test_a_target_is_reached_where_the_curve_first_stands_there(
-    counts_from: int, is_lower_better: bool, expected: list[tuple[float, float, float]], curves: None
+    target: float, is_lower_better: bool, expected: list[tuple[float, float, float]], curves: None
 ) -> None:
-    measure = Measure(
-        "Probe", "return", mean_return, 0.5, is_lower_better=is_lower_better, counts_from=counts_from
-    )
+    measure = Measure("Probe", "return", mean_return, target, is_lower_better=is_lower_better)
     assert score_page.first_reached(measure) == expected
 
 
