@@ -85,6 +85,14 @@ def test_actors_give_what_workers_in_this_process_give(actors: TrainingSetup, tm
     local.close()
 
 
+def test_workers_are_not_left_behind_by_other_work(actors: TrainingSetup) -> None:
+    mine = os.getpriority(os.PRIO_PROCESS, 0)
+    fleet_of(actors).request(weights_of(actors.policy), want_state=True)
+    fleet_of(actors).receive()
+    pids = [process.pid for process in fleet_of(actors).processes]
+    assert [os.getpriority(os.PRIO_PROCESS, pid) for pid in pids] == [mine] * 2
+
+
 def test_weights_are_put_into_the_store_once_an_iteration(
     actors: TrainingSetup, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,6 +17,7 @@ from mappo_unity.errors import ConfigError
 
 ADDRESS = "RAY_ADDRESS"
 CONNECT_S = 10.0
+NICENESS = "RAY_worker_niceness"  # Ray's own variable
 WORKER_CPUS = 1
 """CPUs that a worker asks for."""
 
@@ -48,6 +49,9 @@ class Cluster:
         _check_answers(address)
 
         own: dict[str, Any] = {"num_cpus": workers * WORKER_CPUS, "include_dashboard": False}
+        if NICENESS not in os.environ:
+            # Ray's own value of 15 starves workers beside any other work, while the learner waits for them
+            own["_system_config"] = {"worker_niceness": 0}
         if address == "local":
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no reports from a run to Ray's makers
         with _handlers_kept():
