@@ -155,6 +155,22 @@ def learn(cfg: Config, tmp_path: Path, iterations: int) -> Any:
         return next(batches).of("Probe")[0]
 
 
+def learns(cfg: Config, tmp_path: Path, most: int) -> bool:
+    """Train on a probe; return whether nearly all answers of three batches in a row are right in time.
+
+    When a run finds out is luck, also of the processor's last digits: `most` iterations leave room for that.
+    """
+    streak = 0
+    with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
+        for _ in range(most):
+            batch = next(batches)
+            streak = streak + 1 if share_right(batch.of("Probe")[0]) > 0.95 else 0
+            if streak == 3:
+                return True
+            setup.learn(batch, 0.0)
+    return False
+
+
 def share_right(batch: Any) -> float:
     """Return how many of the answers were right, of the first members of the teams."""
     due = (batch["observation"][..., 0, 1] == 1) & batch[keys.ACTING][..., 0, 0]
@@ -164,22 +180,22 @@ def share_right(batch: Any) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("probe", "rounds", "iterations", "model"),
+    ("probe", "rounds", "most", "model"),
     [
-        ("Recall", 44, 60, {"memory": MemoryKind.lstm}),
-        ("Recall", 44, 60, {"memory": MemoryKind.gru}),
-        ("LongRecall", 122, 100, {"memory": MemoryKind.lstm}),
-        ("LongRecall", 122, 100, {"memory": MemoryKind.gru}),
-        ("StaggeredRecall", 124, 60, {"memory": MemoryKind.lstm}),
-        ("TeamRecall", 44, 60, {"memory": MemoryKind.lstm, "critic": CriticKind.central}),
-        ("TeamRecall", 44, 60, {"memory": MemoryKind.lstm, "critic": CriticKind.poca}),
+        ("Recall", 44, 200, {"memory": MemoryKind.lstm}),
+        ("Recall", 44, 200, {"memory": MemoryKind.gru}),
+        ("LongRecall", 122, 600, {"memory": MemoryKind.lstm}),
+        ("LongRecall", 122, 600, {"memory": MemoryKind.gru}),
+        ("StaggeredRecall", 124, 200, {"memory": MemoryKind.lstm}),
+        ("TeamRecall", 44, 200, {"memory": MemoryKind.lstm, "critic": CriticKind.central}),
+        ("TeamRecall", 44, 200, {"memory": MemoryKind.lstm, "critic": CriticKind.poca}),
     ],
 )
 def test_what_was_seen_long_ago_is_known(
-    probe: str, rounds: int, iterations: int, model: dict[str, Any], tmp_path: Path
+    probe: str, rounds: int, most: int, model: dict[str, Any], tmp_path: Path
 ) -> None:
     cfg = options(probe, rounds, {"sequence_length": 64, "minibatch_size": 256, "lr": 5e-3}, **model)
-    assert share_right(learn(cfg, tmp_path, iterations)) > 0.95
+    assert learns(cfg, tmp_path, most)
 
 
 @pytest.mark.slow

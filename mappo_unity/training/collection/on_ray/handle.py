@@ -93,7 +93,7 @@ class ActorHandle(WorkerHandle):
                 )
             if waited_s > PATIENCE_S and not is_said:
                 logger.warning(
-                    "worker %d has not begun: it takes %d CPU, and %s",
+                    "worker %s has not begun: it takes %d CPU, and %s",
                     self._number,
                     WORKER_CPUS,
                     describe_room(),
