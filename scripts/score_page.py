@@ -204,21 +204,25 @@ def draw_scene(scene: str, measures: list[Measure], path: Path) -> None:
     pyplot.close(figure)
 
 
-def draw_seeds(axis: Any, curves: list[list[tuple[float, float]]]) -> None:
+def draw_seeds(
+    axis: Any, curves: list[list[tuple[float, float]]], color: str = "tab:blue", name: str = ""
+) -> None:
     """Draw every seed thin, and their mean with its spread where all of them have values."""
     import numpy as np
 
+    label = f"{name}, " if name else ""
     for points in curves:
-        axis.plot(*zip(*points), color="tab:blue", linewidth=0.8, alpha=0.6)
+        axis.plot(*zip(*points), color=color, linewidth=0.8, alpha=0.6)
     if len(curves) < 2:
+        axis.plot([], [], color=color, linewidth=0.8, label=f"{label}1 seed")
         return
 
     start, end = max(c[0][0] for c in curves), min(c[-1][0] for c in curves)
     at = np.linspace(start, end, 100)
     values = np.array([np.interp(at, *zip(*points)) for points in curves])
     mean, spread = values.mean(0), values.std(0)
-    axis.plot(at, mean, color="tab:blue", linewidth=2, label=f"mean of {len(curves)} seeds")
-    axis.fill_between(at, mean - spread, mean + spread, color="tab:blue", alpha=0.15, linewidth=0)
+    axis.plot(at, mean, color=color, linewidth=2, label=f"{label}mean of {len(curves)} seeds")
+    axis.fill_between(at, mean - spread, mean + spread, color=color, alpha=0.15, linewidth=0)
 
 
 def draw_levels(axis: Any, measure: Measure, rows: list[dict[str, str]]) -> None:

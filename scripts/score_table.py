@@ -15,6 +15,7 @@ OPTIONs of mappo-train are noted with the run. The pictures need matplotlib.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import subprocess
@@ -98,7 +99,7 @@ def measure_seed(arguments: argparse.Namespace, scene: str, seed: int, options: 
     metrics = read_metrics(folder / "metrics.csv")
     facts = {
         "decisions": metrics[-1]["agent_steps"],
-        "minutes": f"{float(metrics[-1]['wall_s']) / 60:.1f}",
+        "minutes": f"{metrics[-1]['wall_s'] / 60:.1f}",
         "options": " ".join(options),
         "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
     }
@@ -113,7 +114,7 @@ def train(scene: str, seed: int, folder: Path, minutes: float, options: list[str
     lines = [f"env={scene}", f"seed={seed}", f"hydra.run.dir={folder}", *options]
     if (folder / "checkpoints").is_dir():
         lines = [f"resume={folder}"]
-        spent_s = float(read_metrics(folder / "metrics.csv")[-1]["wall_s"])
+        spent_s = read_metrics(folder / "metrics.csv")[-1]["wall_s"]
     left_s = minutes * 60 - spent_s
     if left_s <= 0:
         return
@@ -191,12 +192,10 @@ def is_measured(scene: str, player: str) -> bool:
     return any(row["scene"] == scene and row["policy"] == player for row in read_rows(SCORES))
 
 
-def append_curve(measure: Measure, seed: int, metrics: list[dict[str, str]]) -> None:
+def append_curve(measure: Measure, seed: int, metrics: list[dict[str, int | float]]) -> None:
     """Append a run's curve, thinned out, in decisions and minutes, once 100 episodes have ended."""
     known = [
-        row
-        for row in metrics
-        if float(row["episodes"]) >= 100 and row.get(measure.column) and row[measure.column] != "nan"
+        row for row in metrics if row["episodes"] >= 100 and not math.isnan(row.get(measure.column, math.nan))
     ]
     for row in thin(known, POINTS):
         point = {
@@ -204,8 +203,8 @@ def append_curve(measure: Measure, seed: int, metrics: list[dict[str, str]]) -> 
             "column": measure.column,
             "seed": seed,
             "decisions": row["agent_steps"],
-            "minutes": f"{float(row['wall_s']) / 60:.2f}",
-            "value": f"{float(row[measure.column]):.4g}",
+            "minutes": f"{row['wall_s'] / 60:.2f}",
+            "value": f"{row[measure.column]:.4g}",
         }
         append(CURVES, point)
 
