@@ -159,6 +159,55 @@ def test_schedules_reach_the_optimizer_and_the_loss():
     assert float(learner.loss.entropy_coeff) == pytest.approx(0.015)
 
 
+def test_learning_rates_are_steered_by_the_kl_of_updates():
+    learner = make_learner(lr=1e-3, critic_lr=4e-3, lr_schedule=Schedule.constant, lr_target_kl=0.02)
+    rates = learner.rates
+
+    # within a factor of two nothing changes; then a third less, a half more; nothing else learns faster
+    for kl, lr in (
+        (0.039, 1e-3),
+        (0.041, 1e-3 / 1.5),
+        (0.011, 1e-3 / 1.5),
+        (0.009, 1e-3),
+        (math.inf, 1e-3 / 1.5),
+    ):
+        rates.steer(kl)
+        assert rates.begin(0.5) == pytest.approx(lr)
+        groups = learner.optimizer.param_groups
+        assert [group["lr"] for group in groups] == pytest.approx([lr, 4 * lr])
+
+    # not farther than 0.01 to 10 times the scheduled rates
+    for kl, lr in ((1.0, 1e-5), (0.0, 1e-2)):
+        for _ in range(30):
+            rates.steer(kl)
+        assert rates.begin(0.0) == pytest.approx(lr)
+
+
+def test_an_update_that_goes_too_far_is_followed_by_a_slower_one_also_after_resuming():
+    learner = make_learner(lr=0.5, epochs=8, max_kl=0.05, lr_target_kl=0.02, lr_schedule=Schedule.constant)
+    batch = make_batch(learner)
+    assert learner.learn(*whole(batch), 0.0)["rolled_back"] == 1.0
+    assert learner.learn(*whole(batch), 0.0)["lr"] == pytest.approx(0.5 / 1.5)
+
+    resumed = make_learner(lr=0.5, lr_target_kl=0.02, lr_schedule=Schedule.constant)
+    resumed.load_state_dict(learner.state_dict())
+    assert resumed.rates.begin(0.0) == learner.rates.begin(0.0) == pytest.approx(0.5 / 1.5**2)
+
+    free = make_learner(lr=0.5, epochs=8, max_kl=0.05, lr_schedule=Schedule.constant)
+    free.learn(*whole(batch), 0.0)
+    assert free.learn(*whole(batch), 0.0)["lr"] == 0.5
+
+
+def test_a_critic_that_learns_alone_does_not_steer_the_rates():
+    learner = make_learner(lr=1e-3, lr_target_kl=0.02, critic_warmup_steps=1, lr_schedule=Schedule.constant)
+    batch = make_batch(learner)
+    assert learner.learn(*whole(batch), 0.0)["critic_warmup"] == 1.0
+    assert learner.rates.scale == 1.0
+
+    learner.learn(*whole(batch), 0.0)
+    assert learner.rates.scale != 1.0
+
+
 def test_the_huber_threshold_is_the_one_asked_for():
     learner = make_learner(value_loss=ValueLoss.huber, huber_delta=4.0, value_coef=1.0)
     rows = prepared(learner, make_batch(learner))

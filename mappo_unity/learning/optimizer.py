@@ -15,6 +15,9 @@ from mappo_unity.config.schema import Optimizer, PPOConfig
 from mappo_unity.learning.advantage import scheduled
 from mappo_unity.learning.reduction import ALONE, Reduction
 
+STEER = 1.5  # what a rate is multiplied or divided by after an update
+SCALES = 0.01, 10.0  # between which a steered rate stays, in units of the scheduled one
+
 
 def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch.optim.Optimizer:
     """Build the optimizer, with a group for the actor and one for the critic.
@@ -26,15 +29,41 @@ def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch
     return kind(groups, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=cfg.optimizer_eps, fused=True)
 
 
-def set_learning_rates(optimizer: torch.optim.Optimizer, cfg: PPOConfig, progress: float) -> float:
-    """Set the rates of both groups after a share of the run, 0 to 1; return the actor's."""
-    lr = scheduled(cfg.lr_schedule, cfg.lr, cfg.lr_final, progress)
-    start = cfg.lr if cfg.critic_lr is None else cfg.critic_lr
-    critic_lr = scheduled(cfg.lr_schedule, start, cfg.lr_final, progress)
+class LearningRates:
+    """The learning rates of both groups: their schedule, steered by how far updates move the policy.
 
-    for group, rate in zip(optimizer.param_groups, (lr, critic_lr)):
-        group["lr"] = rate
-    return lr
+    Steering is that of rsl_rl (`PPO.update`, schedule "adaptive"; Schulman et al., arXiv 1707.06347, section
+    4, has the same rule for a penalty), here once an update.
+
+    Args:
+        optimizer: of `make_optimizer`.
+        cfg: the learner's options.
+
+    Attributes: `scale`, what the scheduled rates are multiplied by; 1 without steering.
+    """
+
+    def __init__(self, optimizer: torch.optim.Optimizer, cfg: PPOConfig) -> None:
+        self._optimizer, self._cfg, self.scale = optimizer, cfg, 1.0
+
+    def begin(self, progress: float) -> float:
+        """Set the rates after a share of the run, 0 to 1; return the actor's."""
+        cfg = self._cfg
+        starts = cfg.lr, cfg.lr if cfg.critic_lr is None else cfg.critic_lr
+        rates = [self.scale * scheduled(cfg.lr_schedule, start, cfg.lr_final, progress) for start in starts]
+
+        for group, rate in zip(self._optimizer.param_groups, rates):
+            group["lr"] = rate
+        return rates[0]
+
+    def steer(self, kl: float) -> None:
+        """Take note of how far an update moved the policy; of one that failed `kl` is infinite."""
+        target = self._cfg.lr_target_kl
+        if target is None:
+            return
+        if kl > 2 * target:
+            self.scale = max(self.scale / STEER, SCALES[0])
+        elif kl < target / 2:
+            self.scale = min(self.scale * STEER, SCALES[1])
 
 
 def cloned(state: Any) -> Any:

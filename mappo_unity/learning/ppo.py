@@ -40,11 +40,11 @@ from mappo_unity.learning.networks.encoders import channels_first, running_norms
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.optimizer import (
     CriticWarmup,
+    LearningRates,
     clip_gradients,
     cloned,
     in_two_groups,
     make_optimizer,
-    set_learning_rates,
 )
 from mappo_unity.learning.proximal import enter_proximal, needs_proximal, stale_kl, truncated_ratio
 from mappo_unity.learning.reduction import ALONE, Reduction, check_reduced
@@ -79,6 +79,7 @@ class PolicyLearner:
         actor.keeps_components = cfg.ratio is RatioKind.component
         self.loss = MaskedClipPPOLoss(actor, critic, cfg)
         self.optimizer = make_optimizer(actor, critic, cfg)
+        self.rates = LearningRates(self.optimizer, cfg)
         self.warmup = CriticWarmup(cfg.critic_warmup_steps, actor)
         self.params = [*actor.parameters(), *critic.parameters()]
         is_normalized = cfg.normalize_values is not ValueNormKind.none
@@ -138,13 +139,12 @@ class PolicyLearner:
 
     def _set_schedules(self, progress: float) -> dict[str, float]:
         cfg = self.cfg
-        lr = set_learning_rates(self.optimizer, cfg, progress)
         clip = scheduled(cfg.clip_schedule, cfg.clip_epsilon, cfg.clip_epsilon_final, progress)
         entropy = scheduled(cfg.entropy_schedule, cfg.entropy_coef, cfg.entropy_coef_final, progress)
         self.loss.clip_epsilon.fill_(clip)
         self.loss.entropy_coeff.fill_(entropy)
 
-        return {"lr": lr, "clip_epsilon": clip, "entropy_coef": entropy}
+        return {"lr": self.rates.begin(progress), "clip_epsilon": clip, "entropy_coef": entropy}
 
     @torch.no_grad()
     def prepare(
@@ -223,6 +223,8 @@ class PolicyLearner:
         if rolled_back:
             self._load_trainable(before)
             self.rollbacks += 1
+        if not self.warmup.active:  # which moves no policy
+            self.rates.steer(math.inf if rolled_back else max(kl_epoch, kl_after))
 
         return metrics | {
             "rolled_back": float(rolled_back),
@@ -284,6 +286,7 @@ class PolicyLearner:
             "updates": self.updates,
             "rollbacks": self.rollbacks,
             "decisions": self.warmup.decisions,
+            "lr_scale": self.rates.scale,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -297,3 +300,4 @@ class PolicyLearner:
         self.reader.load_state_dict(state.get("critic_states", {}))
         self.rollbacks, self.warmup.decisions = int(state["rollbacks"]), int(state.get("decisions", 0))
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2
+        self.rates.scale = float(state.get("lr_scale", 1.0))  # since 0.3

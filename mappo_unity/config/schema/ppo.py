@@ -92,6 +92,10 @@ class PPOConfig:
     """How the learning rate falls to ppo.lr_final over max_steps."""
     lr_final: float = 0.0
     """Learning rate at the end of its schedule."""
+    lr_target_kl: Optional[float] = None
+    """Steer the learning rates so that an update moves the policy by about this approximate KL: after one
+    that moved it twice as far they fall by a third, after one that moved it half as far they rise by a half,
+    to between 0.01 and 10 times what their schedule says; null: the schedule alone."""
     schedules_count_batch: bool = False
     """Whether schedules count the decisions of the batch that is learnt, so that the last one is learnt with
     the final values (as ML-Agents), or only those before it."""
@@ -208,6 +212,7 @@ class PPOConfig:
         above("ppo.huber_delta", self.huber_delta, 0)
 
         above("ppo.max_grad_norm", self.max_grad_norm, 0)
+        above("ppo.lr_target_kl", self.lr_target_kl, 0)
         above("ppo.target_kl", self.target_kl, 0)
         above("ppo.max_kl", self.max_kl, 0)
         if (
