@@ -18,6 +18,7 @@ from mappo_unity.config.schema import (
     ValueLoss,
     ValueNormKind,
 )
+from mappo_unity.errors import ConfigError
 from mappo_unity.learning.loss import ACTOR_LEARNS
 from mappo_unity.learning.networks.actor_critic import make_actor, make_critic
 from mappo_unity.learning.networks.distributions import ActionLayout
@@ -157,6 +158,16 @@ def test_schedules_reach_the_optimizer_and_the_loss():
     assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(5.5e-4)
     assert float(learner.loss.clip_epsilon) == pytest.approx(0.2)
     assert float(learner.loss.entropy_coeff) == pytest.approx(0.015)
+
+
+def test_a_weight_of_entropy_below_0_takes_randomness_away():
+    learner = make_learner(lr=1e-2, lr_schedule=Schedule.constant, entropy_coef_final=-1.0)
+    batch = make_batch(learner)
+    entropies = [learner.learn(*whole(batch), 1.0)["entropy"] for _ in range(2)]
+    assert entropies[1] < entropies[0] - 0.05
+
+    with pytest.raises(ConfigError, match="ppo.entropy_coef_final must be >= -1"):
+        make_learner(entropy_coef_final=-1.1)
 
 
 def test_learning_rates_are_steered_by_the_kl_of_updates():

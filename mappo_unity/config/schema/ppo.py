@@ -145,7 +145,7 @@ class PPOConfig:
     entropy_schedule: Schedule = Schedule.linear
     """How the entropy weight falls to ppo.entropy_coef_final over max_steps."""
     entropy_coef_final: float = 0.0
-    """Entropy weight at the end of its schedule."""
+    """Entropy weight at the end of its schedule; below 0 it takes randomness away."""
     entropy: EntropyKind = EntropyKind.sum
     """How the entropies of continuous columns become one: their sum, or their mean (as ML-Agents)."""
     value_coef: float = 0.5
@@ -206,7 +206,7 @@ class PPOConfig:
         at_least("ppo.num_minibatches", self.num_minibatches, 1)
 
         at_least("ppo.entropy_coef", self.entropy_coef, 0)
-        at_least("ppo.entropy_coef_final", self.entropy_coef_final, 0)
+        at_least("ppo.entropy_coef_final", self.entropy_coef_final, -1)
         at_least("ppo.value_coef", self.value_coef, 0)
         between("ppo.value_norm_beta", self.value_norm_beta, 0, 1)
         above("ppo.huber_delta", self.huber_delta, 0)
