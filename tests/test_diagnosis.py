@@ -153,6 +153,12 @@ def test_a_return_must_have_risen_by_five_standard_errors() -> None:
     assert found(return_mean=np.r_[0.0, np.full(39, 0.26)]) == []
     assert found(return_mean=np.r_[0.0, np.full(39, -0.26)]) == ["falls"]
 
+    # returns that rise spread wider; a reward that is met by luck, late and once, is no rise
+    rising = np.linspace(0, 40, 40)
+    assert found(return_mean=rising, return_std=3 * rising) == []
+    once = np.r_[np.zeros(36), np.full(4, 0.01)]
+    assert found(return_mean=once, return_std=10 * once) == ["no rise"]
+
 
 def test_nothing_is_judged_before_half_of_the_steps() -> None:
     assert found(options={"max_steps": "81000"}, return_mean=0.0) == []

@@ -109,10 +109,15 @@ class Evidence:
         full = np.isfinite(value) & (ended >= window)
         if full.sum() < 2:
             return math.nan, math.nan, math.nan
-        last = value[full][-max(1, int(full.sum()) // 5) :]
-        # of the widest window: early ones may not have met a reward that later ones do by luck
-        error = spread[full].max() / math.sqrt(window)
-        return float(value[full][0]), float(last.mean()), max(_RISE * float(error), 1e-6)
+        value, spread, ended = value[full], spread[full], ended[full]
+        late = slice(-max(1, len(value) // 5), None)
+
+        # The first window's error is that of the widest one up to half of the run: others may have met a
+        # reward by luck that it did not, while returns that rise spread ever wider.
+        first_error = spread[: (len(spread) + 1) // 2].max() / math.sqrt(window)
+        last_error = spread[late].max() / math.sqrt(max(window, ended[-1] - ended[late][0]))
+        least = _RISE * float(max(first_error, last_error))
+        return float(value[0]), float(value[late].mean()), max(least, 1e-6)
 
     @cached_property
     def has_risen(self) -> bool:
