@@ -302,7 +302,7 @@ def test_value_clipping_follows_the_schedule():
         clip_schedule=Schedule.linear,
         value_coef=1.0,
     )
-    learner._set_schedules(0.5)
+    learner.loss.begin(0.5)
     rows = prepared(learner, make_batch(learner))
     with torch.no_grad():
         value = learner.critic(rows.clone())["state_value"]

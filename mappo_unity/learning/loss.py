@@ -17,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from mappo_unity import keys
 from mappo_unity.config.schema import EntropyKind, ObjectiveKind, PPOConfig, RatioKind, ValueLoss
-from mappo_unity.learning.advantage import last_mean
+from mappo_unity.learning.advantage import last_mean, scheduled
 from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import ActionDistribution
 from mappo_unity.learning.networks.poca import PocaCritic
@@ -74,6 +74,15 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         self._value: Callable[..., Tensor] = compiled(value_method(critic.module), cfg.compile)
         self.critic_keys = [str(key) for key in critic.in_keys]
         self.log_ratio = self.ratio = self.entropy = torch.zeros(())
+
+    def begin(self, progress: float) -> dict[str, float]:
+        """Set clipping and the entropy's weight after a share of the run, 0 to 1; return them."""
+        cfg = self.cfg
+        clip = scheduled(cfg.clip_schedule, cfg.clip_epsilon, cfg.clip_epsilon_final, progress)
+        entropy = scheduled(cfg.entropy_schedule, cfg.entropy_coef, cfg.entropy_coef_final, progress)
+        self.clip_epsilon.fill_(clip)
+        self.entropy_coeff.fill_(entropy)
+        return {"clip_epsilon": clip, "entropy_coef": entropy}
 
     def forward(self, rows: TensorDictBase) -> dict[str, Tensor]:
         """Return ``loss_objective``, ``loss_critic`` and ``loss_entropy``, scalars to be added.

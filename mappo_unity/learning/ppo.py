@@ -28,7 +28,6 @@ from mappo_unity.learning.advantage import (
     estimate_streams,
     last_mean,
     make_view,
-    scheduled,
     value_metrics,
 )
 from mappo_unity.learning.carried import VALUED, CarriedRounds, has_value
@@ -121,7 +120,8 @@ class PolicyLearner:
             following: what was seen after them, see `keys.FINAL`, `keys.CUT_OFF` and `keys.CUT_OFF_AT`.
             progress: share of the run that is over, 0 to 1, for the schedules.
         """
-        settings = self._set_schedules(progress) | self.rewards.begin(progress) | self.warmup.begin(batch)
+        settings = {"lr": self.rates.begin(progress)} | self.loss.begin(progress)
+        settings |= self.rewards.begin(progress) | self.warmup.begin(batch)
         for norm in self.norms if self.actor.moving_norms else ():
             norm.load_state_dict(self.actor.moving_norms[0].state_dict())  # the critic's follow
 
@@ -136,15 +136,6 @@ class PolicyLearner:
             # after the update, which must not see it
             update_norms(self.warmup.moving(self.norms), batch, self.reduction)
         return metrics | settings
-
-    def _set_schedules(self, progress: float) -> dict[str, float]:
-        cfg = self.cfg
-        clip = scheduled(cfg.clip_schedule, cfg.clip_epsilon, cfg.clip_epsilon_final, progress)
-        entropy = scheduled(cfg.entropy_schedule, cfg.entropy_coef, cfg.entropy_coef_final, progress)
-        self.loss.clip_epsilon.fill_(clip)
-        self.loss.entropy_coeff.fill_(entropy)
-
-        return {"lr": self.rates.begin(progress), "clip_epsilon": clip, "entropy_coef": entropy}
 
     @torch.no_grad()
     def prepare(
