@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from learn_scene import mappo_eval, read_rows
-from score_measures import measures_of
+from score_measures import measures_of, rounded
 
 from mappo_unity.config.compose import load_config
 from mappo_unity.policies.export import export_checkpoint
@@ -108,7 +108,7 @@ def earned(said: dict[str, Any], behavior: str) -> str:
     if "behaviors" in said:
         own = next(value for name, value in said["behaviors"].items() if name.split("?")[0] == behavior)
     value = own.get("mean_group_return") or own["mean_return"]
-    return f"{value:.3g} +- {own['stderr']:.1g}"
+    return f"{rounded(value)} +- {rounded(own['stderr'], 1)}"
 
 
 def write(cards: list[dict[str, Any]]) -> None:
