@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from learn_scene import mappo_eval, read_rows
-from score_measures import measures_of, rounded
+from score_measures import measures_of
 
 from mappo_unity.config.compose import load_config
+from mappo_unity.diagnosis.evidence import amount
 from mappo_unity.policies.export import export_checkpoint
 from mappo_unity.policies.policy_files import ZOO, ZOO_FOLDER, choose_checkpoint
 from mappo_unity.runs.metrics_csv import read_metrics
@@ -108,7 +109,8 @@ def earned(said: dict[str, Any], behavior: str) -> str:
     if "behaviors" in said:
         own = next(value for name, value in said["behaviors"].items() if name.split("?")[0] == behavior)
     value = own.get("mean_group_return") or own["mean_return"]
-    return f"{rounded(value)} +- {rounded(own['stderr'], 1)}"
+    error = float(f"{own['stderr']:.1g}")  # one digit of it
+    return f"{amount(value)} +- {amount(error)}"
 
 
 def write(cards: list[dict[str, Any]]) -> None:

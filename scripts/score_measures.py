@@ -40,11 +40,6 @@ class Measure:
         return value <= self.target if self.is_lower_better else value >= self.target
 
 
-def rounded(value: float, digits: int = 3) -> str:
-    """Return a number by so many digits, and never fewer than stand before its point."""
-    return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:,.0f}"
-
-
 def mean_return(said: dict[str, Any]) -> Figure:
     """The mean return of an agent's episode."""
     return said["mean_return"], said["stderr"]

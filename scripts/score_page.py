@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from learn_scene import read_rows
-from score_measures import MEASURES, Measure, rounded
+from score_measures import MEASURES, Measure
+
+from mappo_unity.diagnosis.evidence import amount
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -100,9 +102,9 @@ def both_ways(rows: list[dict[str, str]]) -> str:
     for sampled in ("True", "False"):
         values = [float(row["value"]) for row in rows if row["sampled"] == sampled]
         if len(values) == 1:
-            texts.append(rounded(values[0]))
+            texts.append(amount(values[0]))
         elif values:
-            texts.append(f"**{rounded(statistics.mean(values))}** ({', '.join(map(rounded, values))})")
+            texts.append(f"**{amount(statistics.mean(values))}** ({', '.join(map(amount, values))})")
     return " / ".join(texts) or "-"
 
 
@@ -136,8 +138,8 @@ def summary_row(measure: Measure, rows: list[dict[str, str]]) -> str:
     sampled = [row for row in rows if row["sampled"] == "True"]
     seeds = [float(row["value"]) for row in sampled if is_tuned_on(row)]
     values = {row["policy"]: float(row["value"]) for row in sampled}
-    ours = f"**{rounded(statistics.mean(seeds))}**" + (f" (of {len(seeds)})" if len(seeds) < 3 else "")
-    random, unity = (rounded(values[player]) if player in values else "-" for player in FIXED)
+    ours = f"**{amount(statistics.mean(seeds))}**" + (f" (of {len(seeds)})" if len(seeds) < 3 else "")
+    random, unity = (amount(values[player]) if player in values else "-" for player in FIXED)
 
     # the seed in the middle, of those that came there
     firsts = sorted(first_reached(measure), key=lambda point: point[1])
