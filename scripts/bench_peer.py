@@ -37,6 +37,12 @@ TRAINERS = "mlagents-learn", "mappo-unity"
 COLORS = "tab:orange", "tab:blue"
 BINS = 12  # points of a curve
 LAST = 0.1  # share of a run whose episodes make its last return
+CONFIGURATIONS = {
+    "CooperativePushBlock": "PushBlockCollab",
+    "GridFoodCollector": "FoodCollector",
+    "Pyramids": "PyramidsRND",
+}
+"""Official files of another name than the scene's; of two for Pyramids the one with the preset's novelty."""
 
 
 def main() -> None:
@@ -138,7 +144,8 @@ def their_command(
     """
     import yaml
 
-    (official,) = arguments.official.glob(f"p*/{scene}.yaml")  # ppo/ or poca/
+    name = CONFIGURATIONS.get(scene, scene)
+    (official,) = arguments.official.glob(f"p*/{name}.yaml")  # ppo/ or poca/
     configuration = yaml.safe_load(official.read_text())
     for behavior in configuration["behaviors"].values() if steps is not None else ():
         behavior["max_steps"] = steps

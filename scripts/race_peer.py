@@ -4,13 +4,15 @@
 Three train a scene, one after the other, each for MINUTES of wall-clock, its start included: mlagents-learn
 with the official configuration through mappo-player, our preset through the same player, and our preset with
 the scene embedded. A run that ends by itself (max_steps) is over earlier. Returns through the player are
-those that the player itself notes; embedded ones are those of metrics.csv.
+those that the player itself notes; embedded ones are those of metrics.csv. Where teams play against each
+other no return tells who plays well: what each has saved then plays matches, against random players and
+against what mlagents-learn has saved.
 
     python scripts/race_peer.py --peer VENV/bin/mlagents-learn --official ml-agents/config \\
         --scenes 3DBall=3 Basic=3 [--seeds 0] [--out outputs/race]
     python scripts/race_peer.py --draw          # only the table docs/benchmarks/race.md and the picture
 
-What was measured stands in docs/benchmarks/race.csv, and is not run again.
+What was measured stands in docs/benchmarks/race.csv and race_matches.csv, and is not run again.
 """
 
 from __future__ import annotations
@@ -27,11 +29,13 @@ from pathlib import Path
 from typing import Any
 
 from bench_peer import ROOT, make_player, their_command
-from learn_scene import HERE, append, read_rows, thin
+from learn_scene import HERE, append, mappo_eval, read_rows, thin
+from score_measures import share_won
 
 from mappo_unity.runs.metrics_csv import read_metrics
 
 RACE = ROOT / "docs/benchmarks/race.csv"
+MATCHES = ROOT / "docs/benchmarks/race_matches.csv"
 PAGE = ROOT / "docs/benchmarks/race.md"
 PEER, PLAYER, EMBEDDED = "mlagents-learn", "preset through the player", "preset embedded"
 COLORS = {PEER: "tab:orange", PLAYER: "tab:cyan", EMBEDDED: "tab:blue"}
@@ -47,6 +51,8 @@ TARGETS = {
 """Returns that show a scene learnt."""
 WINDOW = 100  # episodes of a mean
 POINTS = 60  # of a curve
+COMPETITIVE = ("SoccerTwos",)
+NUM_MATCHES = 400
 
 
 def main() -> None:
@@ -69,21 +75,26 @@ def main() -> None:
             order = [PEER, PLAYER, EMBEDDED] if seed % 2 == 0 else [EMBEDDED, PLAYER, PEER]
             for who in order:
                 race(arguments, scene, seed, who, 60 * float(minutes))
+            if scene in COMPETITIVE:
+                play_matches(arguments, scene, seed)
 
     write_page()
 
 
 def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s: float) -> None:
     """Let one train for its time, unless that has been done, and append its curve."""
-    if any((row["scene"], row["who"], int(row["seed"])) == (scene, who, seed) for row in read_rows(RACE)):
+    known = read_rows(RACE) + read_rows(MATCHES)
+    if any((row["scene"], row["who"], int(row["seed"])) == (scene, who, seed) for row in known):
         return
-    folder = arguments.out.resolve() / f"{scene}-{who.replace(' ', '_')}-{seed}"
+    folder = folder_of(arguments, scene, seed, who)
     shutil.rmtree(folder, ignore_errors=True)  # of a run that was cut off
     folder.mkdir(parents=True)
 
     command = command_of(arguments, scene, seed, who, folder)
     load, start = os.getloadavg()[0], time.time()
     seconds = run_for(command, folder / "log", limit_s)
+    if scene in COMPETITIVE:
+        return
 
     points = embedded_curve(folder, start) if who == EMBEDDED else player_curve(folder, start)
     facts = {
@@ -98,6 +109,45 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
     print(scene, who, seed, facts, points[-1:], flush=True)
 
 
+def folder_of(arguments: argparse.Namespace, scene: str, seed: int, who: str) -> Path:
+    """Return where one of the three trains."""
+    return Path(arguments.out.resolve() / f"{scene}-{who.replace(' ', '_')}-{seed}")
+
+
+def play_matches(arguments: argparse.Namespace, scene: str, seed: int) -> None:
+    """Let what the three have saved play, unless that has been done; append a row for each opponent."""
+    if any((row["scene"], int(row["seed"])) == (scene, seed) for row in read_rows(MATCHES)):
+        return
+    folders = {who: folder_of(arguments, scene, seed, who) for who in (PEER, PLAYER, EMBEDDED)}
+    theirs = folders[PEER] / "run" / f"{scene}.onnx"
+    for who, folder in folders.items():
+        policy = theirs if who == PEER else folder / "run"
+        for against, opponent in {"random": "random", PEER: theirs}.items():
+            if who == against:
+                continue
+            words = f"run={policy}", f"env={scene}", f"opponent={opponent}", f"episodes={NUM_MATCHES}"
+            said = mappo_eval(*words, "deterministic=false")
+            won, stderr = share_won(said)
+            row = {"scene": scene, "seed": seed, "who": who, "against": against, "won": f"{won:.4g}"}
+            row |= {"stderr": f"{stderr:.2g}", "matches": NUM_MATCHES, "decisions": decisions_of(folder)}
+            append(MATCHES, row | {"minutes": f"{minutes_of(arguments, scene):g}"})
+            print(row, flush=True)
+
+
+def minutes_of(arguments: argparse.Namespace, scene: str) -> float:
+    """Return the minutes that a scene is given."""
+    return float(dict(word.split("=") for word in arguments.scenes)[scene])
+
+
+def decisions_of(folder: Path) -> int:
+    """Return how many decisions a run made: by its own metrics, or those that its player was asked for."""
+    path = folder / "run/metrics.csv"
+    if path.exists():
+        return int(read_metrics(path)[-1]["agent_steps"])
+    with open(folder / "episodes.csv") as file:
+        return int(list(csv.reader(file))[-1][0])
+
+
 def command_of(arguments: argparse.Namespace, scene: str, seed: int, who: str, folder: Path) -> list[Any]:
     """Return the command line of one of the three."""
     if who == PEER:
@@ -110,7 +160,6 @@ def command_of(arguments: argparse.Namespace, scene: str, seed: int, who: str, f
             "env.backend=player",
             f"env.file_name={player}",
             "env.no_graphics=true",
-            "env.num_areas=null",
         ]
     return [HERE / "mappo-train", *lines, "log.progress=false"]
 
@@ -180,6 +229,7 @@ def write_page() -> None:
         loads = " ".join(dict.fromkeys(own[0]["load"] for own in by_who.values()))
         target = f"{TARGETS[scene]:g}: {', '.join(times)}" if scene in TARGETS else "-"
         lines.append(f"| {scene} | {seed} | {limit:g} | {' | '.join(cells)} | {target} | {loads} |")
+    lines += matches_table()
 
     text = PAGE.read_text()
     head, _, rest = text.partition("<!-- table -->\n")
@@ -187,6 +237,22 @@ def write_page() -> None:
     PAGE.write_text(head + "<!-- table -->\n" + "\n".join(lines) + "\n<!-- end -->\n" + tail)
     print("\n".join(lines))
     draw(runs)
+
+
+def matches_table() -> list[str]:
+    """Return the lines of a table: who won what share of the decided matches."""
+    cells: dict[tuple[str, str, str, str], dict[str, str]] = {}
+    for row in read_rows(MATCHES):
+        key = row["scene"], row["seed"], row["minutes"], row["against"]
+        share = f"{100 * float(row['won']):.1f} % ({100 * float(row['stderr']):.1f})"
+        cells.setdefault(key, {})[row["who"]] = f"{share}, {int(row['decisions']) / 1e6:.2f} M"
+    if not cells:
+        return []
+    names = [PEER, PLAYER, EMBEDDED]
+    lines = ["", f"| matches | seed | minutes | against | {' | '.join(names)} |", "|---" * 7 + "|"]
+    for key, by_who in cells.items():
+        lines.append(f"| {' | '.join(key)} | {' | '.join(by_who.get(who, '-') for who in names)} |")
+    return lines
 
 
 def reached(rows: list[dict[str, str]], scene: str) -> str:
