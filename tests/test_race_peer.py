@@ -1,0 +1,69 @@
+"""scripts/race_peer.py: matches of what three trainers saved, their table, the official file it takes."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+
+import bench_peer
+import race_peer
+
+
+@pytest.fixture
+def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
+    """Return the arguments of a race of SoccerTwos whose three runs lie in a folder."""
+    monkeypatch.setattr(race_peer, "MATCHES", tmp_path / "race_matches.csv")
+    arguments = argparse.Namespace(out=tmp_path, scenes=["3DBall=3", "SoccerTwos=10"])
+    for who in (race_peer.PEER, race_peer.PLAYER, race_peer.EMBEDDED):
+        run = race_peer.folder_of(arguments, "SoccerTwos", 0, who) / "run"
+        run.mkdir(parents=True)
+        if who == race_peer.PEER:
+            (run.parent / "episodes.csv").write_text("40,0,1,5.0\n250000,0,1,9.0\n")
+        else:
+            (run / "metrics.csv").write_text("agent_steps,return_mean\n100,0\n500000,1\n")
+    return arguments
+
+
+def test_what_was_saved_plays_random_players_and_the_peer_once(arguments, monkeypatch):
+    played: list[tuple[str, ...]] = []
+
+    def evaluate(*words: str) -> dict[str, Any]:
+        played.append(words)
+        won = 0.9 if "opponent=random" in words else 0.75
+        return {
+            "won_of_decided": won,
+            "won_of_decided_low95": won - 0.04,
+            "won_of_decided_high95": won + 0.04,
+        }
+
+    monkeypatch.setattr(race_peer, "mappo_eval", evaluate)
+    race_peer.play_matches(arguments, "SoccerTwos", 0)
+    theirs = arguments.out / "SoccerTwos-mlagents-learn-0/run/SoccerTwos.onnx"
+    ours = [arguments.out / f"SoccerTwos-preset_{how}-0/run" for how in ("through_the_player", "embedded")]
+    wanted = [(theirs, "random"), *((run, against) for run in ours for against in ("random", theirs))]
+    assert [words[0::2][:2] for words in played] == [(f"run={run}", f"opponent={a}") for run, a in wanted]
+
+    lines = race_peer.matches_table()
+    ours_cell = "90.0 % (2.0), 0.50 M"
+    assert lines[3] == f"| SoccerTwos | 0 | 10 | random | 90.0 % (2.0), 0.25 M | {ours_cell} | {ours_cell} |"
+    assert lines[4].startswith("| SoccerTwos | 0 | 10 | mlagents-learn | - | 75.0 % (2.0), 0.50 M |")
+
+    race_peer.play_matches(arguments, "SoccerTwos", 0)
+    assert len(played) == 5, "what stands in the file is not played again"
+
+
+def test_pyramids_is_raced_with_the_official_rnd(tmp_path):
+    for name in ("Pyramids", "PyramidsRND"):
+        (tmp_path / "ppo").mkdir(exist_ok=True)
+        (tmp_path / "ppo" / f"{name}.yaml").write_text(yaml.safe_dump({"behaviors": {name: {}}}))
+    arguments = argparse.Namespace(official=tmp_path, peer=Path("mlagents-learn"))
+    bench_peer.their_command(arguments, "Pyramids", 0, 1000, tmp_path / "player", tmp_path)
+    configuration = yaml.safe_load((tmp_path / "configuration.yaml").read_text())
+    assert configuration == {"behaviors": {"PyramidsRND": {"max_steps": 1000}}}
