@@ -19,9 +19,11 @@ from score_table import has_policies
 from mappo_unity.policies.policy_files import ZOO_FOLDER
 from mappo_unity.scenes.registry import BUILT_IN
 
-SIZES = ((384, 6), (320, 6), (272, 6), (240, 6), (240, 4))
+SIZES = ((384, 6), (320, 6), (272, 6), (240, 6), (208, 6), (240, 4))
 """Widths, in the shape of docs/scenes/NAME.png, and seconds."""
 LARGEST = 850_000  # bytes
+SEEDS = {"Pyramids": 45}
+"""Of the scenes; 1 for all others. This one's whole episode fits into the film."""
 PLACE = Path(__file__).resolve().parents[1] / "docs/scenes"
 
 
@@ -37,7 +39,7 @@ def main() -> None:
         path = PLACE / f"{scene}.gif"
         for width, seconds in SIZES:
             height = round(width * 17 / 30 / 2) * 2
-            size = [f"width={width}", f"height={height}", f"seconds={seconds}", "seed=1"]
+            size = [f"width={width}", f"height={height}", f"seconds={seconds}", f"seed={SEEDS.get(scene, 1)}"]
             lines = [f"env={scene}", "policy=zoo", f"video={path}", *size]
             subprocess.run([HERE / "mappo-play", *lines], check=True)
             if path.stat().st_size <= LARGEST:

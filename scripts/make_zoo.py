@@ -93,12 +93,13 @@ def opponent(run: Path) -> list[str]:
 
 
 def given(run: Path) -> list[str]:
-    """Return the options that a run was started with, but those that say where it lies."""
+    """Return the options of a run, as they were given last; those that say where it lies are left out."""
     import yaml
 
     saved = yaml.safe_load((run / "overrides.yaml").read_text())
     places = "env=", "seed=", "hydra.", "output_dir=", "resume="
-    return [line for entry in saved for line in entry["overrides"] if not line.startswith(places)]
+    lines = [line for entry in saved for line in entry["overrides"] if not line.startswith(places)]
+    return list({line.partition("=")[0]: line for line in lines}.values())
 
 
 def earned(said: dict[str, Any], behavior: str) -> str:
