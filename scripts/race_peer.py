@@ -175,6 +175,7 @@ def run_for(command: list[Any], log: Path, limit_s: float) -> float:
             stderr=subprocess.STDOUT,
             env=environment,
             start_new_session=True,
+            preexec_fn=heed_interrupts,
         )
         try:
             code = process.wait(limit_s)
@@ -189,6 +190,11 @@ def run_for(command: list[Any], log: Path, limit_s: float) -> float:
                 process.wait()
             return limit_s
     return time.monotonic() - start
+
+
+def heed_interrupts() -> None:
+    """Take SIGINT again: a job in the background, as this script may be one, passes on that it is ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def player_curve(folder: Path, start: float) -> list[tuple[float, int, float]]:
