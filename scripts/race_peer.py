@@ -76,7 +76,7 @@ def main() -> None:
             for who in order:
                 race(arguments, scene, seed, who, 60 * float(minutes))
             if scene in COMPETITIVE:
-                play_matches(arguments, scene, seed)
+                play_matches(arguments, scene, seed, float(minutes))
 
     write_page()
 
@@ -111,32 +111,41 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
 
 def folder_of(arguments: argparse.Namespace, scene: str, seed: int, who: str) -> Path:
     """Return where one of the three trains."""
-    return Path(arguments.out.resolve() / f"{scene}-{who.replace(' ', '_')}-{seed}")
+    out: Path = arguments.out
+    return out.resolve() / f"{scene}-{who.replace(' ', '_')}-{seed}"
 
 
-def play_matches(arguments: argparse.Namespace, scene: str, seed: int) -> None:
-    """Let what the three have saved play, unless that has been done; append a row for each opponent."""
-    if any((row["scene"], int(row["seed"])) == (scene, seed) for row in read_rows(MATCHES)):
-        return
-    folders = {who: folder_of(arguments, scene, seed, who) for who in (PEER, PLAYER, EMBEDDED)}
-    theirs = folders[PEER] / "run" / f"{scene}.onnx"
-    for who, folder in folders.items():
+def play_matches(arguments: argparse.Namespace, scene: str, seed: int, minutes: float) -> None:
+    """Let what the three saved after their minutes play; append a row for each opponent, unless it stands."""
+    known = {(row["scene"], int(row["seed"]), row["who"], row["against"]) for row in read_rows(MATCHES)}
+    theirs = folder_of(arguments, scene, seed, PEER) / "run" / f"{scene}.onnx"
+    for who, against in (
+        (PEER, "random"),
+        (PLAYER, "random"),
+        (PLAYER, PEER),
+        (EMBEDDED, "random"),
+        (EMBEDDED, PEER),
+    ):
+        if (scene, seed, who, against) in known:
+            continue
+        folder = folder_of(arguments, scene, seed, who)
         policy = theirs if who == PEER else folder / "run"
-        for against, opponent in {"random": "random", PEER: theirs}.items():
-            if who == against:
-                continue
-            words = f"run={policy}", f"env={scene}", f"opponent={opponent}", f"episodes={NUM_MATCHES}"
-            said = mappo_eval(*words, "deterministic=false")
-            won, stderr = share_won(said)
-            row = {"scene": scene, "seed": seed, "who": who, "against": against, "won": f"{won:.4g}"}
-            row |= {"stderr": f"{stderr:.2g}", "matches": NUM_MATCHES, "decisions": decisions_of(folder)}
-            append(MATCHES, row | {"minutes": f"{minutes_of(arguments, scene):g}"})
-            print(row, flush=True)
-
-
-def minutes_of(arguments: argparse.Namespace, scene: str) -> float:
-    """Return the minutes that a scene is given."""
-    return float(dict(word.split("=") for word in arguments.scenes)[scene])
+        opponent = theirs if against == PEER else against
+        words = f"run={policy}", f"env={scene}", f"opponent={opponent}", f"episodes={NUM_MATCHES}"
+        won, stderr = share_won(mappo_eval(*words, "deterministic=false"))
+        row = {
+            "scene": scene,
+            "seed": seed,
+            "who": who,
+            "against": against,
+            "won": f"{won:.4g}",
+            "stderr": f"{stderr:.2g}",
+            "matches": NUM_MATCHES,
+            "decisions": decisions_of(folder),
+            "minutes": f"{minutes:g}",
+        }
+        append(MATCHES, row)
+        print(row, flush=True)
 
 
 def decisions_of(folder: Path) -> int:

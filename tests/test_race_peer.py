@@ -20,7 +20,7 @@ import race_peer
 def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
     """Return the arguments of a race of SoccerTwos whose three runs lie in a folder."""
     monkeypatch.setattr(race_peer, "MATCHES", tmp_path / "race_matches.csv")
-    arguments = argparse.Namespace(out=tmp_path, scenes=["3DBall=3", "SoccerTwos=10"])
+    arguments = argparse.Namespace(out=tmp_path)
     for who in (race_peer.PEER, race_peer.PLAYER, race_peer.EMBEDDED):
         run = race_peer.folder_of(arguments, "SoccerTwos", 0, who) / "run"
         run.mkdir(parents=True)
@@ -44,7 +44,7 @@ def test_what_was_saved_plays_random_players_and_the_peer_once(arguments, monkey
         }
 
     monkeypatch.setattr(race_peer, "mappo_eval", evaluate)
-    race_peer.play_matches(arguments, "SoccerTwos", 0)
+    race_peer.play_matches(arguments, "SoccerTwos", 0, 10.0)
     theirs = arguments.out / "SoccerTwos-mlagents-learn-0/run/SoccerTwos.onnx"
     ours = [arguments.out / f"SoccerTwos-preset_{how}-0/run" for how in ("through_the_player", "embedded")]
     wanted = [(theirs, "random"), *((run, against) for run in ours for against in ("random", theirs))]
@@ -55,8 +55,13 @@ def test_what_was_saved_plays_random_players_and_the_peer_once(arguments, monkey
     assert lines[3] == f"| SoccerTwos | 0 | 10 | random | 90.0 % (2.0), 0.25 M | {ours_cell} | {ours_cell} |"
     assert lines[4].startswith("| SoccerTwos | 0 | 10 | mlagents-learn | - | 75.0 % (2.0), 0.50 M |")
 
-    race_peer.play_matches(arguments, "SoccerTwos", 0)
+    race_peer.play_matches(arguments, "SoccerTwos", 0, 10.0)
     assert len(played) == 5, "what stands in the file is not played again"
+
+    lines = race_peer.MATCHES.read_text().splitlines(keepends=True)
+    race_peer.MATCHES.write_text("".join(lines[:-1]))  # interrupted before the last
+    race_peer.play_matches(arguments, "SoccerTwos", 0, 10.0)
+    assert played[5:] == played[4:5]
 
 
 def test_pyramids_is_raced_with_the_official_rnd(tmp_path):
