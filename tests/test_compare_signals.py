@@ -1,0 +1,103 @@
+"""The table of scripts/compare_signals.py: what stands in docs/rewards.md is what was measured."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+
+import compare_signals
+from compare_signals import SIGNALS, Signal
+
+PROBE = Signal("Hallway", "probe", "a probe", ("bc.strength=0.5",), "bc.demos")
+PRESET = Signal("Hallway", "none", "the preset")
+
+
+def test_the_table_of_the_page_is_that_of_the_measured_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = tmp_path / "rewards.md"
+    page.write_text(compare_signals.PAGE.read_text(encoding="utf-8"))
+    monkeypatch.setattr(compare_signals, "PAGE", page)
+    compare_signals.write_page()
+
+    written = (compare_signals.ROOT / "docs/rewards.md").read_text(encoding="utf-8")
+    assert page.read_text() == written, "python scripts/compare_signals.py --draw writes it anew"
+
+
+def test_options_of_every_signal_are_taken_by_its_scene() -> None:
+    from mappo_unity.config.compose import compose_config
+
+    for signal in SIGNALS:
+        demos = [f"{signal.demos}=[recorded.demo]"] if signal.demos else []
+        compose_config([f"env={signal.scene}", *signal.options, *demos])
+
+
+def metrics(*rows: tuple[int, int, float]) -> list[dict[str, Any]]:
+    """Return rows of a run: decisions, episodes, mean return; a minute each."""
+    return [
+        {"agent_steps": steps, "episodes": episodes, "return_mean": value, "wall_s": 60.0 * place}
+        for place, (steps, episodes, value) in enumerate(rows)
+    ]
+
+
+def test_a_run_reaches_the_benchmark_after_a_hundred_episodes_at_the_soonest() -> None:
+    rows = metrics((100, 20, 0.9), (200, 100, 0.6), (300, 140, 0.7), (400, 180, 0.8))
+    first = compare_signals.first_at(PROBE, rows)
+    assert first is not None and first["agent_steps"] == 300
+    assert compare_signals.first_at(PROBE, rows[:2]) is None
+
+
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> Path:
+    """Write rows as a CSV file."""
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+def test_a_preset_is_read_from_the_table_of_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    score = {"scene": "Hallway", "sampled": "True", "value": 0.9, "decisions": 500}
+    scores = [
+        {**score, "policy": "1"},
+        {**score, "policy": "0", "value": 0.8},
+        {**score, "policy": "3"},  # kept aside
+        {**score, "policy": "0", "sampled": "False"},
+        {**score, "policy": "unity"},
+        {**score, "policy": "2", "scene": "Basic"},
+    ]
+    point = {"scene": "Hallway", "seed": "0", "minutes": 1.0}
+    curve = [
+        {**point, "decisions": 100, "value": "nan"},
+        {**point, "decisions": 200, "value": 0.75},
+        {**point, "decisions": 300, "value": 0.72},
+    ]
+    monkeypatch.setattr(compare_signals, "SCORES", write_csv(tmp_path / "scores.csv", scores))
+    monkeypatch.setattr(compare_signals, "CURVES", write_csv(tmp_path / "curves.csv", curve))
+
+    rows = compare_signals.rows_of(PRESET)
+    assert [row["seed"] for row in rows] == ["0", "1"]
+    assert compare_signals.cells(rows) == [
+        "0, 1",
+        "0.00 M, never",
+        "1, -",
+        "**0.85** (0.80, 0.90)",
+        "0.00 M, 0.00 M",
+    ]
+
+
+@pytest.mark.parametrize("words", [[], ["--demos", "nowhere"]])
+def test_without_its_recordings_nothing_is_trained(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["compare_signals.py", *words])
+    with pytest.raises(SystemExit) as end:
+        compare_signals.main()
+    assert end.value.code == 2
+    assert "--demos" in capsys.readouterr().err.splitlines()[-1]
