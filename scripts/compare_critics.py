@@ -22,7 +22,7 @@ from collections import defaultdict
 from pathlib import Path
 
 from learn_scene import append, read_rows, thin
-from score_page import BENCHMARKS, ROOT, Point, draw_seeds
+from score_page import BENCHMARKS, ROOT, Point, draw_seeds, put_between
 from score_table import train
 
 from mappo_unity.config.compose import compose_config
@@ -118,8 +118,7 @@ def write_page() -> None:
         cells = CRITICS[critic][0], ", ".join(sorted(own)), decisions, values, f"{pace:.1f}"
         lines.append(f"| {' | '.join(cells)} |")
 
-    head, _, rest = PAGE.read_text().partition(BEGIN)
-    PAGE.write_text(head + BEGIN + "\n".join(lines) + "\n" + END + rest.partition(END)[2])
+    PAGE.write_text(put_between(PAGE.read_text(), (BEGIN, END), lines))
     print("\n".join(lines))
     draw(curves)
 

@@ -21,8 +21,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from decisions_to import first_at
 from learn_scene import append, mappo_eval, read_rows
-from score_page import BENCHMARKS, CURVES, ROOT, SCORES
+from score_page import BENCHMARKS, ROOT, SCORES, curves_of, is_tuned_on, put_between
 from score_table import train
 
 from mappo_unity.runs.metrics_csv import read_metrics
@@ -31,7 +32,6 @@ ROWS = BENCHMARKS / "signals.csv"
 PAGE = ROOT / "docs/rewards.md"
 BEGIN, END = "<!-- signals -->\n", "<!-- end of signals -->\n"
 BENCHMARK = {"Pyramids": 1.75, "Hallway": 0.7}  # ML-Agents' own, mean of 100 episodes
-EPISODES = 100  # of a mean return, before which it is luck
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def measure(arguments: argparse.Namespace, signal: Signal, seed: int) -> None:
     learn(arguments, signal, seed, folder)
 
     metrics = read_metrics(folder / "metrics.csv")
-    first = first_at(signal, metrics)
+    first = first_at(metrics, BENCHMARK[signal.scene])
     said = mappo_eval(f"run={folder}", f"episodes={arguments.episodes}", "deterministic=false")
     row = {
         "date": time.strftime("%Y-%m-%d"),
@@ -141,21 +141,15 @@ def measure(arguments: argparse.Namespace, signal: Signal, seed: int) -> None:
 
 def learn(arguments: argparse.Namespace, signal: Signal, seed: int, folder: Path) -> None:
     """Train, or resume, a run; one that imitates is over at the benchmark."""
-    options = [*signal.options, "update_threads=1"]
+    options, goal = [*signal.options, "update_threads=1"], BENCHMARK[signal.scene]
     if signal.demos is not None:
         metrics = folder / "metrics.csv"
-        if metrics.is_file() and first_at(signal, read_metrics(metrics)) is not None:
+        if metrics.is_file() and first_at(read_metrics(metrics), goal) is not None:
             return
         recording = signal.recording(arguments.demos).resolve()
-        options += [f"{signal.demos}=[{recording}]", f"stop_at_return={BENCHMARK[signal.scene]}"]
+        options += [f"{signal.demos}=[{recording}]", f"stop_at_return={goal}"]
 
     train(signal.scene, seed, folder, arguments.minutes, options)
-
-
-def first_at(signal: Signal, metrics: list[dict[str, int | float]]) -> dict[str, int | float] | None:
-    """Return the first row of a run at whose time the last 100 episodes stood at the benchmark, if any."""
-    goal = BENCHMARK[signal.scene]
-    return next((r for r in metrics if r["episodes"] >= EPISODES and r["return_mean"] >= goal), None)
 
 
 def is_of(row: dict[str, str], signal: Signal) -> bool:
@@ -170,8 +164,7 @@ def rows_of(signal: Signal) -> list[dict[str, str]]:
             (
                 preset_row(signal, row)
                 for row in read_rows(SCORES)
-                if (row["scene"], row["sampled"]) == (signal.scene, "True")
-                and row["policy"] in {"0", "1", "2"}
+                if (row["scene"], row["sampled"]) == (signal.scene, "True") and is_tuned_on(row)
             ),
             key=lambda row: row["seed"],
         )
@@ -180,23 +173,16 @@ def rows_of(signal: Signal) -> list[dict[str, str]]:
 
 def preset_row(signal: Signal, score: dict[str, str]) -> dict[str, str]:
     """Return a row of scores.csv as one of signals.csv, with where its curve stood at the benchmark first."""
-    reached, minutes = next(
-        (
-            (point["decisions"], point["minutes"])
-            for point in read_rows(CURVES)
-            if (point["scene"], point["seed"]) == (signal.scene, score["policy"])
-            and float(point["value"]) >= BENCHMARK[signal.scene]
-        ),
-        ("", ""),
-    )
-    return {**score, "seed": score["policy"], "reached": reached, "reached_minutes": minutes}
+    seed, goal = score["policy"], BENCHMARK[signal.scene]
+    curve = curves_of(signal.scene, "return_mean").get(seed, [])
+    reached = next(([f"{point[0]:.0f}", f"{point[1]}"] for point in curve if point[2] >= goal), ["", ""])
+    return {**score, "seed": seed, "reached": reached[0], "reached_minutes": reached[1]}
 
 
 def write_page() -> None:
     """Put a table for each scene between the marks of the page."""
     lines = [line for scene in BENCHMARK for line in ("", *table(scene))][1:]
-    head, _, rest = PAGE.read_text().partition(BEGIN)
-    PAGE.write_text(head + BEGIN + "\n".join(lines) + "\n" + END + rest.partition(END)[2])
+    PAGE.write_text(put_between(PAGE.read_text(), (BEGIN, END), lines))
     print("\n".join(lines))
 
 

@@ -19,6 +19,9 @@ from mappo_unity.runs.metrics_csv import read_metrics
 
 EPISODES = 100  # of a mean return
 
+Metrics = list[dict[str, int | float]]
+"""Rows of metrics.csv."""
+
 
 def main() -> None:
     """Print a row for each run."""
@@ -37,20 +40,27 @@ def main() -> None:
             print(row(path.parent, arguments.goal, arguments.metric))
 
 
+def first_at(metrics: Metrics, goal: float, metric: str = "return_mean") -> dict[str, int | float] | None:
+    """Return the first row of a run's metrics at which one is at least `goal`, if there is any."""
+    return next((line for line in with_value(metrics, metric) if line[metric] >= goal), None)
+
+
+def with_value(metrics: Metrics, metric: str) -> Metrics:
+    """Return the rows that have a value: of matches few have, and a mean return needs episodes."""
+    needed = EPISODES if metric == "return_mean" else 0
+    return [
+        line
+        for line in metrics
+        if line.get("episodes", 0) >= needed and not math.isnan(line.get(metric, math.nan))
+    ]
+
+
 def row(run: Path, goal: float, metric: str) -> str:
     """Return a run's row of the table."""
-    metrics = [
-        {name: float(value) for name, value in line.items() if value}
-        for line in read_metrics(run / "metrics.csv")
-    ]
-    # not every row has a value: of matches few have, and returns need episodes
-    needed = EPISODES if metric == "return_mean" else 0
-    values = [
-        line.get(metric, math.nan) if line.get("episodes", 0) >= needed else math.nan for line in metrics
-    ]
-    reached = next((line for line, value in zip(metrics, values) if value >= goal), None)
+    metrics = read_metrics(run / "metrics.csv")
+    reached = first_at(metrics, goal, metric)
     first = f"{reached['agent_steps']:,.0f} | {reached['wall_s'] / 60:.1f}" if reached else "- | -"
-    known = [value for value in values if not math.isnan(value)]
+    known = [line[metric] for line in with_value(metrics, metric)]
     best, last = (f"{max(known):.2f}", f"{known[-1]:.2f}") if known else ("-", "-")
     return f"| {run.parent.name}/{run.name} | {first} | {best} | {last} | {metrics[-1]['agent_steps']:,.0f} |"
 

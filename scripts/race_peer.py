@@ -31,6 +31,7 @@ from typing import Any
 from bench_peer import ROOT, make_player, their_command
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
 from score_measures import share_won
+from score_page import put_between
 
 from mappo_unity.runs.metrics_csv import read_metrics
 
@@ -246,10 +247,7 @@ def write_page() -> None:
         lines.append(f"| {scene} | {seed} | {limit:g} | {' | '.join(cells)} | {target} | {loads} |")
     lines += matches_table()
 
-    text = PAGE.read_text()
-    head, _, rest = text.partition("<!-- table -->\n")
-    tail = rest.partition("<!-- end -->\n")[2]
-    PAGE.write_text(head + "<!-- table -->\n" + "\n".join(lines) + "\n<!-- end -->\n" + tail)
+    PAGE.write_text(put_between(PAGE.read_text(), ("<!-- table -->\n", "<!-- end -->\n"), lines))
     print("\n".join(lines))
     draw(runs)
 

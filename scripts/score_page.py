@@ -125,12 +125,16 @@ def first_reached(measure: Measure) -> list[Point]:
 
 def with_summary(readme: str) -> str:
     """Return README with today's table: the mean over seeds beside random play and Unity's policy."""
-    head, _, rest = readme.partition(BEGIN)
-    _, _, tail = rest.partition(END)
-
     names = "scene", "measure", "random", "preset", "Unity's policy", "target", "target first reached after"
     lines = table(names, summary_row, read_rows(SCORES))
-    return head + BEGIN + "\n".join(lines) + "\n" + END + tail
+    return put_between(readme, (BEGIN, END), lines)
+
+
+def put_between(text: str, marks: tuple[str, str], lines: Sequence[str]) -> str:
+    """Return a page with these lines in place of those between the two marks."""
+    begin, end = marks
+    head, _, rest = text.partition(begin)
+    return head + begin + "\n".join(lines) + "\n" + end + rest.partition(end)[2]
 
 
 def summary_row(measure: Measure, rows: list[dict[str, str]]) -> str:

@@ -12,9 +12,9 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 import compare_signals
+import score_page
 from compare_signals import SIGNALS, Signal
 
-PROBE = Signal("Hallway", "probe", "a probe", ("bc.strength=0.5",), "bc.demos")
 PRESET = Signal("Hallway", "none", "the preset")
 
 
@@ -48,9 +48,9 @@ def metrics(*rows: tuple[int, int, float]) -> list[dict[str, Any]]:
 
 def test_a_run_reaches_the_benchmark_after_a_hundred_episodes_at_the_soonest() -> None:
     rows = metrics((100, 20, 0.9), (200, 100, 0.6), (300, 140, 0.7), (400, 180, 0.8))
-    first = compare_signals.first_at(PROBE, rows)
+    first = compare_signals.first_at(rows, compare_signals.BENCHMARK["Hallway"])
     assert first is not None and first["agent_steps"] == 300
-    assert compare_signals.first_at(PROBE, rows[:2]) is None
+    assert compare_signals.first_at(rows[:2], compare_signals.BENCHMARK["Hallway"]) is None
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> Path:
@@ -72,14 +72,14 @@ def test_a_preset_is_read_from_the_table_of_scores(tmp_path: Path, monkeypatch: 
         {**score, "policy": "unity"},
         {**score, "policy": "2", "scene": "Basic"},
     ]
-    point = {"scene": "Hallway", "seed": "0", "minutes": 1.0}
+    point = {"scene": "Hallway", "seed": "0", "minutes": 1.0, "column": "return_mean"}
     curve = [
         {**point, "decisions": 100, "value": "nan"},
         {**point, "decisions": 200, "value": 0.75},
         {**point, "decisions": 300, "value": 0.72},
     ]
     monkeypatch.setattr(compare_signals, "SCORES", write_csv(tmp_path / "scores.csv", scores))
-    monkeypatch.setattr(compare_signals, "CURVES", write_csv(tmp_path / "curves.csv", curve))
+    monkeypatch.setattr(score_page, "CURVES", write_csv(tmp_path / "curves.csv", curve))
 
     rows = compare_signals.rows_of(PRESET)
     assert [row["seed"] for row in rows] == ["0", "1"]
