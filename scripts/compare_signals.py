@@ -3,8 +3,7 @@
 
 Novelty (RND, curiosity), what an expert did (cloning, GAIL), and the environment's own rewards alone. Runs
 lie in OUT/SCENE-SIGNAL-SEED and are resumed after any interruption; what was measured is appended to
-docs/benchmarks/signals.csv and is not run again. The signal that is the scene's preset has its runs in
-scripts/score_table.py's tables and is only read from there. The table stands in docs/rewards.md.
+docs/benchmarks/signals.csv and is not run again. The table stands in docs/rewards.md.
 
     python scripts/compare_signals.py --demos FOLDER [--scenes Pyramids] [--signals curiosity] [--seeds 0 1 2]
     python scripts/compare_signals.py --draw                  # only the table
@@ -23,7 +22,7 @@ from pathlib import Path
 
 from decisions_to import first_at
 from learn_scene import append, mappo_eval, read_rows
-from score_page import BENCHMARKS, ROOT, SCORES, curves_of, is_tuned_on, put_between
+from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
 
 from mappo_unity.runs.metrics_csv import read_metrics
@@ -83,7 +82,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    keys = sorted({signal.key for signal in SIGNALS if signal.options})
+    keys = sorted({signal.key for signal in SIGNALS})
     parser.add_argument("--scenes", nargs="+", default=list(BENCHMARK), choices=list(BENCHMARK))
     parser.add_argument("--signals", nargs="+", default=keys, choices=keys)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
@@ -94,7 +93,7 @@ def main() -> None:
     parser.add_argument("--draw", action="store_true", help="run nothing")
     arguments = parser.parse_args()
 
-    wanted = [] if arguments.draw else [signal for signal in SIGNALS if signal.options]
+    wanted = [] if arguments.draw else SIGNALS
     wanted = [s for s in wanted if s.scene in arguments.scenes and s.key in arguments.signals]
     if any(s.demos for s in wanted) and arguments.demos is None:
         parser.error("--demos FOLDER is needed: cloning and GAIL imitate recordings")
@@ -158,25 +157,8 @@ def is_of(row: dict[str, str], signal: Signal) -> bool:
 
 
 def rows_of(signal: Signal) -> list[dict[str, str]]:
-    """Return what was measured of a signal, by seed; a preset's is what score_table.py measured."""
-    if not signal.options:
-        return sorted(
-            (
-                preset_row(signal, row)
-                for row in read_rows(SCORES)
-                if (row["scene"], row["sampled"]) == (signal.scene, "True") and is_tuned_on(row)
-            ),
-            key=lambda row: row["seed"],
-        )
+    """Return what was measured of a signal, by seed."""
     return sorted((row for row in read_rows(ROWS) if is_of(row, signal)), key=lambda row: int(row["seed"]))
-
-
-def preset_row(signal: Signal, score: dict[str, str]) -> dict[str, str]:
-    """Return a row of scores.csv as one of signals.csv, with where its curve stood at the benchmark first."""
-    seed, goal = score["policy"], BENCHMARK[signal.scene]
-    curve = curves_of(signal.scene, "return_mean").get(seed, [])
-    reached = next(([f"{point[0]:.0f}", f"{point[1]}"] for point in curve if point[2] >= goal), ["", ""])
-    return {**score, "seed": seed, "reached": reached[0], "reached_minutes": reached[1]}
 
 
 def write_page() -> None:

@@ -12,7 +12,6 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 import compare_signals
-import score_page
 from compare_signals import SIGNALS, Signal
 
 PRESET = Signal("Hallway", "none", "the preset")
@@ -53,42 +52,28 @@ def test_a_run_reaches_the_benchmark_after_a_hundred_episodes_at_the_soonest() -
     assert compare_signals.first_at(rows[:2], compare_signals.BENCHMARK["Hallway"]) is None
 
 
-def write_csv(path: Path, rows: list[dict[str, Any]]) -> Path:
-    """Write rows as a CSV file."""
-    with open(path, "w", newline="") as file:
+def test_a_signal_s_cells_are_of_its_own_rows_by_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = {"scene": "Hallway", "signal": "none", "decisions": 500_000, "value": 0.9}
+    rows = [
+        {**row, "seed": 1, "reached": "", "reached_minutes": ""},  # never at the benchmark
+        {**row, "seed": 0, "reached": 200_000, "reached_minutes": 1.4, "value": 0.8},
+        {**row, "seed": 2, "signal": "gail", "reached": 1, "reached_minutes": 1},
+        {**row, "seed": 2, "scene": "Pyramids", "reached": 1, "reached_minutes": 1},
+    ]
+    with open(tmp_path / "signals.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    return path
+    monkeypatch.setattr(compare_signals, "ROWS", tmp_path / "signals.csv")
 
-
-def test_a_preset_is_read_from_the_table_of_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    score = {"scene": "Hallway", "sampled": "True", "value": 0.9, "decisions": 500}
-    scores = [
-        {**score, "policy": "1"},
-        {**score, "policy": "0", "value": 0.8},
-        {**score, "policy": "3"},  # kept aside
-        {**score, "policy": "0", "sampled": "False"},
-        {**score, "policy": "unity"},
-        {**score, "policy": "2", "scene": "Basic"},
-    ]
-    point = {"scene": "Hallway", "seed": "0", "minutes": 1.0, "column": "return_mean"}
-    curve = [
-        {**point, "decisions": 100, "value": "nan"},
-        {**point, "decisions": 200, "value": 0.75},
-        {**point, "decisions": 300, "value": 0.72},
-    ]
-    monkeypatch.setattr(compare_signals, "SCORES", write_csv(tmp_path / "scores.csv", scores))
-    monkeypatch.setattr(score_page, "CURVES", write_csv(tmp_path / "curves.csv", curve))
-
-    rows = compare_signals.rows_of(PRESET)
-    assert [row["seed"] for row in rows] == ["0", "1"]
-    assert compare_signals.cells(rows) == [
+    assert compare_signals.cells(compare_signals.rows_of(PRESET)) == [
         "0, 1",
-        "0.00 M, never",
+        "0.20 M, never",
         "1, -",
         "**0.85** (0.80, 0.90)",
-        "0.00 M, 0.00 M",
+        "0.50 M, 0.50 M",
     ]
 
 
