@@ -26,7 +26,10 @@ HERE = Path(sys.executable).parent
 DEMOS = {
     "3DBall": ("Expert3DBall", ["max_steps=60000", "ppo.lr=1e-3"]),
     "Basic": ("ExpertBasic", ["max_steps=20000", "ppo.lr=1e-3"]),
-    "Hallway": ("ExpertHallway", ["max_steps=100000", "ppo.lr=2e-3"]),
+    "Hallway": (
+        "ExpertHallway",
+        ["max_steps=100000", "ppo.lr=2e-3", "model.hidden=[256,256]", "model.memory_size=256"],
+    ),
     "Pyramids": ("ExpertPyramid", ["max_steps=100000", "ppo.lr=1e-3", "model.hidden=[128,128]"]),
     "PushBlock": ("ExpertPushBlock", ["max_steps=100000", "ppo.lr=1e-3"]),
 }
