@@ -451,20 +451,27 @@ def test_jobs_side_by_side_update_no_line_in_place() -> None:
     assert text.getvalue().startswith("[job 3] 100/1,000 steps") and "\x1b" not in text.getvalue()
 
 
-def test_time_left_is_reckoned_from_the_last_half_minute() -> None:
+def time_left(*rows: tuple[float, int]) -> str:
+    """Return what the last line says is left of 10,000 steps after rows of seconds and steps."""
     console, text = plain_console()
     clock = Clock()
     progress = Progress(console, 10_000, clock)
-    for seconds, steps in (
-        (0, 0),
-        (100, 100),
-        (110, 1100),
-        (120, 2100),
-        (130, 3100),
-    ):  # slow, then 100 a second
+    for seconds, steps in rows:
         clock.now = seconds
         progress.update({"agent_steps": steps})
-    assert text.getvalue().splitlines()[-1].endswith("1:09 left")  # 6900 / 100
+    return text.getvalue().splitlines()[-1].split("  ")[-1]
+
+
+def test_time_left_is_reckoned_from_the_last_five_minutes() -> None:
+    slow, then = (0, 0), [(1000 + 100 * place, 100 + 1000 * place) for place in range(4)]
+    assert time_left(slow, *then) == "11:30 left"  # 6900 at 10 a second
+
+
+def test_matches_between_two_rows_hardly_lengthen_the_time_left() -> None:
+    steady = [(10.0 * place, 200 * place) for place in range(1, 21)]
+    assert time_left(*steady) == "5:00 left"  # 6000 at 20 a second
+    # a series took 60 s: 5800 steps at 4000 in 260 s
+    assert time_left(*steady, (270.0, 4200)) == "6:17 left"
 
 
 def test_on_a_terminal_one_line_is_updated_and_messages_stand_above(tmp_path: Path) -> None:

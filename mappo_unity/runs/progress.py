@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.text import Text
 
 PLAIN_INTERVAL_S = 2.0  # between two lines where there is no terminal
-RATE_WINDOW_S = 30.0  # over which the speed behind "left" is measured
+RATE_WINDOW_S = 300.0  # of the speed behind "left": so long that a series of matches does not rule it
 
 
 @dataclass(frozen=True)
