@@ -3,10 +3,11 @@
 
 Unity's recordings of the real scenes (FOLDER holds Expert3DBall.demo, ExpertBasic.demo ...) are learnt from
 alone (`bc.only=true`), and the clones are evaluated here: a good one is a proof of the scene, too. Printed is
-a line a scene: the recording's decisions, its mean return (of episodes that ended; for one that did not,
-what was earned until then) and the clone's, sampled, with its standard error.
+a line for each scene and seed: the recording's decisions, its mean return (of episodes that ended; for one
+that did not, what was earned until then) and the clone's, sampled, with its standard error.
 
-    python scripts/clone_demos.py FOLDER [--scenes 3DBall Basic Hallway Pyramids PushBlock] [--episodes 100]
+    python scripts/clone_demos.py FOLDER [--scenes 3DBall Basic Hallway Pyramids PushBlock] [--seeds 0]
+        [--episodes 100]
 """
 
 from __future__ import annotations
@@ -26,10 +27,7 @@ HERE = Path(sys.executable).parent
 DEMOS = {
     "3DBall": ("Expert3DBall", ["max_steps=60000", "ppo.lr=1e-3"]),
     "Basic": ("ExpertBasic", ["max_steps=20000", "ppo.lr=1e-3"]),
-    "Hallway": (
-        "ExpertHallway",
-        ["max_steps=100000", "ppo.lr=2e-3", "model.hidden=[256,256]", "model.memory_size=256"],
-    ),
+    "Hallway": ("ExpertHallway", ["max_steps=100000", "ppo.lr=2e-3"]),
     "Pyramids": ("ExpertPyramid", ["max_steps=100000", "ppo.lr=1e-3", "model.hidden=[128,128]"]),
     "PushBlock": ("ExpertPushBlock", ["max_steps=100000", "ppo.lr=1e-3"]),
 }
@@ -44,6 +42,7 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", nargs="+", choices=DEMOS, default=list(DEMOS))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--episodes", type=int, default=100)
     arguments = parser.parse_args()
 
@@ -51,16 +50,19 @@ def main() -> None:
     for scene in arguments.scenes:
         name, options = DEMOS[scene]
         demo = read_demo(arguments.folder / f"{name}.demo")
-        with tempfile.TemporaryDirectory() as out:
-            clone(scene, Path(demo.source), Path(out, "run"), options)
-            earned, error = evaluate(Path(out, "run"), arguments.episodes, RECORDED_AS.get(scene, []))
         whole = demo.returns[: int(demo.done.sum())]
         recorded = (whole if len(whole) else demo.returns).mean()
-        print(
-            f"{scene}: {len(demo)} decisions recorded, mean return {recorded:.2f}; "
-            f"clone {earned:.2f} +- {error:.2f} ({arguments.episodes} episodes)",
-            flush=True,
-        )
+        print(f"{scene}: {len(demo)} decisions recorded, mean return {recorded:.2f}")
+
+        for seed in arguments.seeds:
+            with tempfile.TemporaryDirectory() as out:
+                clone(scene, Path(demo.source), Path(out, "run"), [f"seed={seed}", *options])
+                earned, error = evaluate(Path(out, "run"), arguments.episodes, RECORDED_AS.get(scene, []))
+            share = f", {earned / recorded:.0%} of the recording's" if len(whole) else ""
+            print(
+                f"  clone, seed {seed}: {earned:.2f} +- {error:.2f} ({arguments.episodes} episodes){share}",
+                flush=True,
+            )
 
 
 def clone(scene: str, demo: Path, folder: Path, options: list[str]) -> None:
