@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Train CooperativePushBlock with each kind of critic, and draw their returns in one picture.
+"""Train the scenes of cooperation with each kind of critic, and draw their returns in one picture a scene.
 
 MAPPO's central critic, independent learners' local one (IPPO), MA-POCA's and attention; all else is the
-preset of the scene, whose schedules are kept: a run here is the beginning of the preset's. Runs lie in
-OUT/CRITIC-SEED and are resumed after any interruption; what was trained is appended to
+preset of the scene. With fewer --steps than the preset's the entropy falls as in the preset's beginning. Runs
+lie in OUT/SCENE-CRITIC-SEED and are resumed after any interruption; what was trained is appended to
 docs/benchmarks/critics.csv and is not run again. Table and picture stand on the scene's page.
 
-    python scripts/compare_critics.py [--critics central local] [--seeds 0 1 2] [--steps 4000000]
-    python scripts/compare_critics.py --draw                  # only the table and the picture
+    python scripts/compare_critics.py DungeonEscape [--critics central local] [--seeds 0 1 2] [--steps N]
+    python scripts/compare_critics.py --draw                  # only the tables and the pictures
 
-The picture needs matplotlib.
+The pictures need matplotlib.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import argparse
 import os
 import statistics
 import time
-from collections import defaultdict
+from itertools import product
 from pathlib import Path
 
 from learn_scene import append, read_rows, thin
@@ -28,7 +28,8 @@ from score_table import train
 from mappo_unity.config.compose import compose_config
 from mappo_unity.runs.metrics_csv import read_metrics
 
-SCENE = "CooperativePushBlock"
+SCENES = {"CooperativePushBlock": 4_000_000, "DungeonEscape": 2_000_000}
+"""Agent decisions of a run."""
 CRITICS = {
     "central": ("central (MAPPO)", "tab:blue"),
     "local": ("local (IPPO)", "tab:orange"),
@@ -36,7 +37,7 @@ CRITICS = {
     "attention": ("attention", "tab:red"),
 }
 CURVES = BENCHMARKS / "critics.csv"
-PAGE, PICTURE = ROOT / f"docs/scenes/{SCENE}.md", BENCHMARKS / "critics.png"
+PAGES = ROOT / "docs/scenes"
 BEGIN, END = "<!-- critics -->\n", "<!-- end of critics -->\n"
 POINTS = 60  # of a curve
 
@@ -49,32 +50,40 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("scenes", nargs="*", default=list(SCENES), metavar="SCENE", help=", ".join(SCENES))
     parser.add_argument("--critics", nargs="+", default=list(CRITICS), choices=list(CRITICS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--steps", type=int, default=4_000_000, help="agent decisions of a run")
+    parser.add_argument("--steps", type=int, help="agent decisions of a run, instead of the scene's")
     parser.add_argument("--minutes", type=float, default=240.0, help="of collecting and learning, for a run")
     parser.add_argument("--out", type=Path, default=Path("outputs/critics"))
     parser.add_argument("--draw", action="store_true", help="run nothing")
     arguments = parser.parse_args()
 
-    for seed in [] if arguments.draw else arguments.seeds:
-        for critic in arguments.critics:
-            learn(arguments, critic, seed)
+    for scene in arguments.scenes:
+        if scene not in SCENES:
+            parser.error(f"{scene}: critics are compared in {', '.join(SCENES)}")
+    for scene, seed, critic in product(arguments.scenes, arguments.seeds, arguments.critics):
+        if not arguments.draw:
+            learn(arguments, scene, critic, seed)
 
-    write_page()
+    for scene, curves in read_curves().items():
+        write_page(scene, curves)
+        draw(scene, curves)
 
 
-def learn(arguments: argparse.Namespace, critic: str, seed: int) -> None:
+def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> None:
     """Train one critic from one seed, unless that has been done, and append its curve."""
-    if any((row["critic"], row["seed"]) == (critic, str(seed)) for row in read_rows(CURVES)):
+    key = scene, critic, str(seed)
+    if any((row["scene"], row["critic"], row["seed"]) == key for row in read_rows(CURVES)):
         return
-    folder, load = arguments.out / f"{critic}-{seed}", os.getloadavg()[0]
-    train(SCENE, seed, folder, arguments.minutes, options(critic, arguments.steps))
+    folder, load = arguments.out / "-".join(key), os.getloadavg()[0]
+    train(scene, seed, folder, arguments.minutes, options(scene, critic, arguments.steps or SCENES[scene]))
 
     rows = [row for row in read_metrics(folder / "metrics.csv") if row["episodes"] >= 100]
     for row in thin(rows, POINTS):
         point = {
             "date": time.strftime("%Y-%m-%d"),
+            "scene": scene,
             "critic": critic,
             "seed": seed,
             "decisions": int(row["agent_steps"]),
@@ -83,47 +92,53 @@ def learn(arguments: argparse.Namespace, critic: str, seed: int) -> None:
             "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
         }
         append(CURVES, point)
-    print(critic, seed, rows[-1]["group_return_mean"], flush=True)
+    print(scene, critic, seed, rows[-1]["group_return_mean"], flush=True)
 
 
-def options(critic: str, steps: int) -> list[str]:
+def options(scene: str, critic: str, steps: int) -> list[str]:
     """Return the options of a run that is the beginning of the preset's: its entropy falls as there."""
-    preset = compose_config([f"env={SCENE}"]).config
+    preset = compose_config([f"env={scene}"]).config
     fallen = steps / preset.max_steps
     start, end = preset.ppo.entropy_coef, preset.ppo.entropy_coef_final
     entropy = f"ppo.entropy_coef_final={start + fallen * (end - start):.6g}"
     return [f"model.critic={critic}", f"max_steps={steps}", entropy, "update_threads=1"]
 
 
-def read_curves() -> Curves:
-    """Return what has been trained."""
-    curves: Curves = {critic: defaultdict(list) for critic in CRITICS}
-    for row in read_rows(CURVES):
+def read_curves() -> dict[str, Curves]:
+    """Return what has been trained, by scene."""
+    scenes: dict[str, Curves] = {}
+    for row in sorted(read_rows(CURVES), key=lambda row: list(CRITICS).index(row["critic"])):
         point = float(row["decisions"]), float(row["minutes"]), float(row["value"])
-        curves[row["critic"]][row["seed"]].append(point)
-    return {critic: own for critic, own in curves.items() if own}
+        curves = scenes.setdefault(row["scene"], {})
+        curves.setdefault(row["critic"], {}).setdefault(row["seed"], []).append(point)
+    return scenes
 
 
-def write_page() -> None:
-    """Put the table onto the scene's page, and draw the picture where matplotlib is there."""
-    curves = read_curves()
-    names = "critic", "seeds", "decisions", "group return at the end", "minutes of a million"
+def write_page(scene: str, curves: Curves) -> None:
+    """Put the table onto the scene's page."""
+    names = "critic", "seeds", "decisions", "group return, last tenth", "minutes of a million"
     lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
     for critic, own in curves.items():
         ends = [points[-1] for _, points in sorted(own.items())]
-        values = f"**{statistics.mean(value for *_, value in ends):.2f}** ("
-        values += ", ".join(f"{value:.2f}" for *_, value in ends) + ")"
+        earned = [at_the_end(points) for _, points in sorted(own.items())]
+        values = f"**{statistics.mean(earned):.2f}** ({', '.join(f'{value:.2f}' for value in earned)})"
         decisions = ", ".join(f"{steps / 1e6:.1f} M" for steps in sorted({steps for steps, *_ in ends}))
         pace = statistics.mean(1e6 * minutes / steps for steps, minutes, _ in ends)
         cells = CRITICS[critic][0], ", ".join(sorted(own)), decisions, values, f"{pace:.1f}"
         lines.append(f"| {' | '.join(cells)} |")
 
-    PAGE.write_text(put_between(PAGE.read_text(), (BEGIN, END), lines))
+    page = PAGES / f"{scene}.md"
+    page.write_text(put_between(page.read_text(), (BEGIN, END), lines))
     print("\n".join(lines))
-    draw(curves)
 
 
-def draw(curves: Curves) -> None:
+def at_the_end(points: list[Point]) -> float:
+    """Return the mean of a curve's last tenth: one window of 100 episodes alone is luck."""
+    begin = 0.9 * points[-1][0]
+    return statistics.mean(value for decisions, _, value in points if decisions >= begin)
+
+
+def draw(scene: str, curves: Curves) -> None:
     """Draw the group returns against decisions and against minutes, a colour for each critic."""
     try:
         import matplotlib
@@ -142,9 +157,9 @@ def draw(curves: Curves) -> None:
             draw_seeds(axis, seeds, color, name)
         axis.set(xlabel=label)
         axis.grid(alpha=0.3)
-    axes[0].set(ylabel="group return, last 100 episodes", title=SCENE)
+    axes[0].set(ylabel="group return, last 100 episodes", title=scene)
     axes[1].legend(fontsize="small")
-    figure.savefig(PICTURE, dpi=80)
+    figure.savefig(BENCHMARKS / f"critics-{scene}.png", dpi=80)
     pyplot.close(figure)
 
 

@@ -1,0 +1,82 @@
+"""The tables of scripts/compare_critics.py: what stands on the scenes' pages is what was trained."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+
+import compare_critics
+
+from mappo_unity.config.compose import compose_config
+
+
+def test_the_tables_of_the_pages_are_those_of_the_trained_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages = compare_critics.PAGES
+    monkeypatch.setattr(compare_critics, "PAGES", tmp_path)
+    for scene, curves in compare_critics.read_curves().items():
+        written = (pages / f"{scene}.md").read_text(encoding="utf-8")
+        (tmp_path / f"{scene}.md").write_text(written)
+        compare_critics.write_page(scene, curves)
+        again = (tmp_path / f"{scene}.md").read_text()
+        assert again == written, "python scripts/compare_critics.py --draw writes it anew"
+
+
+@pytest.mark.parametrize("scene", compare_critics.SCENES)
+@pytest.mark.parametrize("critic", compare_critics.CRITICS)
+def test_every_critic_is_trained_by_the_presets_schedule(scene: str, critic: str) -> None:
+    preset = compose_config([f"env={scene}"]).config
+    half = preset.max_steps // 2
+    config = compose_config([f"env={scene}", *compare_critics.options(scene, critic, half)]).config
+    assert (config.model.critic.value, config.max_steps) == (critic, half)
+
+    middle = (preset.ppo.entropy_coef + preset.ppo.entropy_coef_final) / 2
+    assert config.ppo.entropy_coef_final == pytest.approx(middle)
+
+
+def test_a_row_has_the_seeds_of_a_critic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each seed counts with the mean of its last tenth, and critics come in the order of CRITICS."""
+    row = {
+        "scene": "DungeonEscape",
+        "critic": "local",
+        "seed": 0,
+        "decisions": 500_000,
+        "minutes": 1,
+        "value": 0,
+    }
+    end = {**row, "decisions": 1_000_000, "minutes": 3}
+    rows = [row, {**end, "decisions": 950_000, "value": 0.2}, {**end, "value": 0.4}]
+    rows += [{**end, "seed": 1, "value": 0.5}, {**end, "critic": "central", "minutes": 2, "value": 0.6}]
+    with open(tmp_path / "critics.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        writer.writeheader()
+        writer.writerows(rows)
+    page = tmp_path / "DungeonEscape.md"
+    page.write_text(f"before\n{compare_critics.BEGIN}old\n{compare_critics.END}after\n")
+    monkeypatch.setattr(compare_critics, "CURVES", tmp_path / "critics.csv")
+    monkeypatch.setattr(compare_critics, "PAGES", tmp_path)
+
+    [(scene, curves)] = compare_critics.read_curves().items()
+    compare_critics.write_page(scene, curves)
+    lines = page.read_text().splitlines()
+    assert (lines[0], lines[-1]) == ("before", "after") and "old" not in lines
+    assert "| central (MAPPO) | 0 | 1.0 M | **0.60** (0.60) | 2.0 |" in lines
+    assert "| local (IPPO) | 0, 1 | 1.0 M | **0.40** (0.30, 0.50) | 3.0 |" in lines
+    assert lines.index("| central (MAPPO) | 0 | 1.0 M | **0.60** (0.60) | 2.0 |") == len(lines) - 4
+
+
+def test_a_scene_without_a_team_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["compare_critics.py", "Basic"])
+    with pytest.raises(SystemExit) as end:
+        compare_critics.main()
+    assert end.value.code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "Basic" in line and "DungeonEscape" in line
