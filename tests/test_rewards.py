@@ -138,6 +138,30 @@ def test_curiosity_by_hand() -> None:
     assert model.loss(one).item() == pytest.approx(10 * (0.2 * error + 0.8 * np.log(2)), rel=1e-5)
 
 
+def test_rnd_by_hand() -> None:
+    model = RandomNetwork(ObsLayout(1), ActionLayout(0, (2,)), RNDConfig(hidden=[1], strength=1.0))
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.zero_()
+        # the random network says 3 silu(x) + 1, the predictor always 0.5
+        model.target.net[0].weight.fill_(1.0)
+        model.target.net[-1].weight.fill_(3.0)
+        model.target.net[-1].bias.fill_(1.0)
+        model.predictor.net[-1].bias.fill_(0.5)
+
+    seen = Transitions(
+        [torch.tensor([[5.0], [2.0], [0.0]])],
+        torch.tensor([0, 1]),
+        torch.tensor([1, 2]),
+        torch.tensor([[1], [0]]),
+        torch.tensor([False, False]),
+    )
+    # what was seen next counts: 2, then 0; silu(2) = 2 * 0.880797
+    errors = [(3 * 1.761594 + 1 - 0.5) ** 2, (1 - 0.5) ** 2]
+    assert model.rewards(seen).tolist() == pytest.approx(errors, rel=1e-5)
+    assert model.loss(seen).item() == pytest.approx(sum(errors) / 2, rel=1e-5)
+
+
 @pytest.mark.parametrize("kind", [Curiosity, RandomNetwork])
 @pytest.mark.parametrize("layout", [ActionLayout(2, ()), ActionLayout(0, (3, 2)), ActionLayout(1, (4,))])
 def test_what_was_often_seen_earns_little(kind: type, layout: ActionLayout) -> None:
