@@ -18,9 +18,11 @@ from mappo_unity.config.compose import compose_config
 def test_the_tables_of_the_pages_are_those_of_the_trained_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pages = compare_critics.PAGES
+    pages, trained = compare_critics.PAGES, compare_critics.read_curves()
+    if not trained:
+        pytest.skip("no critics have been trained yet: there is no docs/benchmarks/critics.csv")
     monkeypatch.setattr(compare_critics, "PAGES", tmp_path)
-    for scene, curves in compare_critics.read_curves().items():
+    for scene, curves in trained.items():
         written = (pages / f"{scene}.md").read_text(encoding="utf-8")
         (tmp_path / f"{scene}.md").write_text(written)
         compare_critics.write_page(scene, curves)
