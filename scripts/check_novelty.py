@@ -17,6 +17,7 @@ import os
 from pathlib import Path
 
 from learn_scene import mappo_eval
+from score_measures import as_strikers
 from score_table import train
 
 SCENE = "StrikersVsGoalie"
@@ -51,7 +52,7 @@ def report(label: str, policy: list[str], matches: int) -> None:
     """Let a policy's strikers play a random goalie, and print what came of it."""
     # each side of the scene is played in half of the matches
     said = mappo_eval(*policy, "opponent=random", f"episodes={2 * matches}", "deterministic=false")
-    strikers = next(score for side, score in said["as"].items() if side.startswith("Striker"))
+    strikers = as_strikers(said)
     print(
         f"{label}: scored in {strikers['wins']} of {strikers['matches']} matches, "
         f"{strikers['mean_decisions']:.0f} decisions a match",

@@ -9,13 +9,11 @@ from __future__ import annotations
 import argparse
 import os
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
-from learn_scene import mappo_eval
+from learn_scene import HERE, mappo_eval
 
-HERE = Path(sys.executable).parent
 BALLS = [
     (mass, scale) for mass in (0.5, 1, 10) for scale in (0.75, 1, 3)
 ]  # the sampler's ends, and Unity's ball

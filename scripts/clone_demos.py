@@ -15,15 +15,13 @@ from __future__ import annotations
 import argparse
 import os
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
-from learn_scene import mappo_eval
+from learn_scene import HERE, mappo_eval
 
 from mappo_unity.protocol.demos.reader import read_demo
 
-HERE = Path(sys.executable).parent
 DEMOS = {
     "3DBall": ("Expert3DBall", ["max_steps=60000", "ppo.lr=1e-3"]),
     "Basic": ("ExpertBasic", ["max_steps=20000", "ppo.lr=1e-3"]),

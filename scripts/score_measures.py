@@ -65,10 +65,15 @@ def share_won(said: dict[str, Any]) -> Figure:
     return said["won_of_decided"], width / 4
 
 
+def as_strikers(said: dict[str, Any]) -> dict[str, Any]:
+    """What came of the matches as the strikers: matches, wins, mean_decisions and so on."""
+    own: dict[str, Any] = next(score for side, score in said["as"].items() if side.startswith("Striker"))
+    return own
+
+
 def decisions_to_goal(said: dict[str, Any]) -> Figure:
     """Decisions of a match as the strikers; the error is not known."""
-    strikers = next(score for side, score in said["as"].items() if side.startswith("Striker"))
-    return strikers["mean_decisions"], math.nan
+    return as_strikers(said)["mean_decisions"], math.nan
 
 
 MEASURES = (

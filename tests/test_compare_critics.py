@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 import compare_critics
+from learn_scene import append
 
 from mappo_unity.config.compose import compose_config
 
@@ -55,10 +55,8 @@ def test_a_row_has_the_seeds_of_a_critic(tmp_path: Path, monkeypatch: pytest.Mon
     end = {**row, "decisions": 1_000_000, "minutes": 3}
     rows = [row, {**end, "decisions": 950_000, "value": 0.2}, {**end, "value": 0.4}]
     rows += [{**end, "seed": 1, "value": 0.5}, {**end, "critic": "central", "minutes": 2, "value": 0.6}]
-    with open(tmp_path / "critics.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, list(row))
-        writer.writeheader()
-        writer.writerows(rows)
+    for line in rows:
+        append(tmp_path / "critics.csv", line)
     page = tmp_path / "DungeonEscape.md"
     page.write_text(f"before\n{compare_critics.BEGIN}old\n{compare_critics.END}after\n")
     monkeypatch.setattr(compare_critics, "CURVES", tmp_path / "critics.csv")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 import compare_signals
 from compare_signals import SIGNALS, Signal
+from learn_scene import append
 
 PRESET = Signal("Hallway", "none", "the preset")
 
@@ -62,10 +62,8 @@ def test_a_signal_s_cells_are_of_its_own_rows_by_seed(
         {**row, "seed": 2, "signal": "gail", "reached": 1, "reached_minutes": 1},
         {**row, "seed": 2, "scene": "Pyramids", "reached": 1, "reached_minutes": 1},
     ]
-    with open(tmp_path / "signals.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    for line in rows:
+        append(tmp_path / "signals.csv", line)
     monkeypatch.setattr(compare_signals, "ROWS", tmp_path / "signals.csv")
 
     assert compare_signals.cells(compare_signals.rows_of(PRESET)) == [
