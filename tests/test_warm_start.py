@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,10 @@ import torch
 from omegaconf import OmegaConf
 from onnx_fakes import data_of, inputs, make
 from test_onnx_graph import CASES
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+
+import check_warm_starts
 
 from mappo_unity import keys
 from mappo_unity.cli import train_main
@@ -236,6 +241,22 @@ def test_they_choose_the_same_actions_while_they_are_played(shared: Path, file: 
         env.step()
     assert compared >= 10
     env.close()
+
+
+def test_the_table_of_agreement(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """scripts/check_warm_starts.py has a row for each file, and says which one is refused."""
+    (tmp_path / "3DBall.onnx").write_bytes(data_of(make([[8]], 2), [[8]]))
+    (tmp_path / "Walker.onnx").write_bytes(data_of(make([[8]], 2), [[8]]))
+    (tmp_path / "Chess.onnx").write_bytes(b"of a game that is not here")
+    monkeypatch.setattr(sys, "argv", ["check_warm_starts.py", str(tmp_path)])
+    assert check_warm_starts.main() == 1
+
+    ball, chess, walker = capsys.readouterr().out.splitlines()[2:]
+    assert "hidden=[32,32]" in ball and float(ball.split("|")[-2]) < 1e-5
+    assert "no scene has this behavior" in chess
+    assert "refused" in walker and "are 2 continuous and branches [], the behavior's 39 and" in walker
 
 
 def test_a_game_is_trained_on_from_unitys_file(shared: Path, tmp_path: Path, capsys: Any) -> None:
