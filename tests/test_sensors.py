@@ -176,6 +176,14 @@ def test_the_residual_encoder_has_three_stacks_of_two_blocks():
     torch.testing.assert_close(block(x), x + swish[3](silu(swish[1](silu(x)))))
 
 
+def test_the_encoder_of_grids_keeps_where_things_are():
+    """20 cells: 6, then 4; 512 numbers where the default encoder's longer steps leave 32."""
+    net = ImageEncoder((6, 20, 20), kind=ImageKind.grid, width=16)
+    assert [layer.kernel_size for layer in net.conv if isinstance(layer, nn.Conv2d)] == [(5, 5), (3, 3)]
+    assert net.out[0].in_features == 32 * 4 * 4 and net.size == 128
+    assert ImageEncoder((6, 20, 20)).out[0].in_features == 32
+
+
 def test_the_default_encoder_is_the_one_of_older_checkpoints():
     for side, kernel in ((40, (8, 8)), (19, (3, 3))):
         net = ImageEncoder((3, side, side), kind=ModelConfig().image_encoder, width=16)
@@ -184,7 +192,7 @@ def test_the_default_encoder_is_the_one_of_older_checkpoints():
 
 @pytest.mark.parametrize(
     ("kind", "side"),
-    [("simple", 20), ("nature", 36), ("resnet", 15), ("match3", 5), ("dense", 1), ("auto", 1)],
+    [("simple", 20), ("nature", 36), ("resnet", 15), ("match3", 5), ("dense", 1), ("auto", 1), ("grid", 11)],
 )
 def test_an_image_below_an_encoder_s_size_is_refused_with_those_that_fit(kind, side):
     kind = ImageKind(kind)

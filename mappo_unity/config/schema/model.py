@@ -46,6 +46,7 @@ class ImageKind(Enum):
     resnet = "resnet"
     match3 = "match3"
     dense = "dense"
+    grid = "grid"
 
 
 class GoalKind(Enum):
@@ -112,7 +113,8 @@ class ModelConfig:
     image_encoder: ImageKind = ImageKind.auto
     """Encoder of images and grids: ML-Agents' simple (from 20 x 20 on), nature (36), resnet (15), match3 (5)
     or dense (any size), with as many features as the first hidden layer is wide; auto: convolutions that fit
-    the size, 128 features."""
+    the size, 128 features; grid (11): convolutions of short steps, 128 features, for grid sensors, each cell
+    of which counts."""
     goal_conditioning: GoalKind = GoalKind.none
     """Sensors that are goal signals: observations like others (none), and, as ML-Agents' default has it, what
     another network makes the weights of the last hidden layer of (hyper; actors and local critics)."""

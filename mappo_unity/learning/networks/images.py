@@ -1,4 +1,4 @@
-"""Encoders of images and grids: ML-Agents' (trainers/torch_entities/encoders.py), and one for every size.
+"""Encoders of images and grids: ML-Agents' (trainers/torch_entities/encoders.py), and two of our own.
 
 What `model.image_encoder` names is convolutions, a Linear layer and its activation.
 """
@@ -15,7 +15,9 @@ from mappo_unity.config.schema import ImageKind
 from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.contract.images import FIRST, LAST, channel_dim
 
-IMAGE_FEATURES = 128  # of `ImageKind.auto`; ML-Agents' encoders have as many as a hidden layer is wide
+OURS = (ImageKind.auto, ImageKind.grid)
+"""One for every size, and one that keeps more of where things are; both with Swish."""
+IMAGE_FEATURES = 128  # of ours; ML-Agents' encoders have as many as a hidden layer is wide
 
 MIN_SIDES: dict[ImageKind, int] = {
     ImageKind.auto: 1,
@@ -24,6 +26,7 @@ MIN_SIDES: dict[ImageKind, int] = {
     ImageKind.resnet: 15,
     ImageKind.match3: 5,
     ImageKind.dense: 1,
+    ImageKind.grid: 11,
 }
 """The least height and width that an encoder takes."""
 
@@ -38,7 +41,7 @@ class ImageEncoder(nn.Module):
         shape: of an image.
         channel_dim: 0 for ``C, H, W`` (Unity since package 3.0), 2 for ``H, W, C`` (before).
         kind: the encoder.
-        width: features of ML-Agents' encoders; `ImageKind.auto` has its own number.
+        width: features of ML-Agents' encoders; `OURS` have their own number.
     """
 
     def __init__(
@@ -51,7 +54,7 @@ class ImageEncoder(nn.Module):
         super().__init__()
         self.channels_last = channel_dim == LAST
         channels, height, width_px = (shape[2], *shape[:2]) if self.channels_last else shape
-        self.size = IMAGE_FEATURES if kind is ImageKind.auto else width
+        self.size = IMAGE_FEATURES if kind in OURS else width
 
         self.conv = nn.Sequential(*_convolutions(kind, channels, min(height, width_px)), nn.Flatten())
 
@@ -124,10 +127,11 @@ def _convolutions(kind: ImageKind, channels: int, side: int) -> list[nn.Module]:
         ImageKind.nature: [(32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0)],
         ImageKind.match3: [(35, 3, 1, 0), (144, 3, 1, 0)],
         ImageKind.dense: [],
+        ImageKind.grid: [(16, 5, 3, 0), (32, 3, 1, 0)],
     }
     layers: list[nn.Module] = []
     for features, kernel, stride, padding in sizes[kind]:
-        activation = nn.SiLU() if kind is ImageKind.auto else nn.LeakyReLU()
+        activation = nn.SiLU() if kind in OURS else nn.LeakyReLU()
         layers += [nn.Conv2d(channels, features, kernel, stride, padding), activation]
         channels = features
     return layers
@@ -143,6 +147,6 @@ def _resnet(channels: int) -> list[nn.Module]:
 
 
 def _last_activation(kind: ImageKind) -> nn.Module:
-    if kind is ImageKind.auto:
+    if kind in OURS:
         return nn.SiLU()
     return nn.ReLU() if kind is ImageKind.resnet else nn.LeakyReLU()

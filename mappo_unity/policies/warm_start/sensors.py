@@ -20,6 +20,8 @@ _KINDS = {
     ((35, 3, 1, 0), (144, 3, 1, 0)): "match3",
 }
 """Encoders of ML-Agents (trainers/torch_entities/encoders.py) by their convolutions."""
+_GRID = ((16, 5, 3, 0), (32, 3, 1, 0))
+"""The one of ours that has a name; all others with Swish are `auto`."""
 RESNET_CONVOLUTIONS = 3 * (1 + 2 * 2)  # of each stack one, and two blocks of two
 
 
@@ -47,11 +49,11 @@ class Image(NamedTuple):
     @property
     def kind(self) -> str:
         """What `model.image_encoder` calls it; "" for one that it does not know."""
+        sizes = tuple(convolution.size for convolution in self.convolutions)
         if self.activations == {"silu"}:
-            return "auto"
+            return "grid" if sizes == _GRID else "auto"
         if len(self.convolutions) == RESNET_CONVOLUTIONS and "silu" in self.activations:
             return "resnet"
-        sizes = tuple(convolution.size for convolution in self.convolutions)
         return _KINDS.get(sizes, "") if self.activations == {"leaky_relu"} else ""
 
 
