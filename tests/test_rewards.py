@@ -20,6 +20,8 @@ from mappo_unity.config.schema import (
     CuriosityConfig,
     EnvConfig,
     ExtrinsicConfig,
+    GAILConfig,
+    ImageKind,
     LogConfig,
     ModelConfig,
     PPOConfig,
@@ -33,7 +35,7 @@ from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.rewards.curiosity import Curiosity
 from mappo_unity.learning.rewards.rnd import RandomNetwork
-from mappo_unity.learning.rewards.streams import IntrinsicStream, RewardStreams
+from mappo_unity.learning.rewards.streams import IntrinsicStream, RewardStreams, make_models
 from mappo_unity.learning.transitions import Transitions, find_transitions
 from mappo_unity.learning.value_norm import ValueNorm, by_stream
 from mappo_unity.runs import checkpoint
@@ -160,6 +162,25 @@ def test_rnd_by_hand() -> None:
     errors = [(3 * 1.761594 + 1 - 0.5) ** 2, (1 - 0.5) ** 2]
     assert model.rewards(seen).tolist() == pytest.approx(errors, rel=1e-5)
     assert model.loss(seen).item() == pytest.approx(sum(errors) / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("encoder", "kernel"),
+    [(ImageKind.auto, 8), (ImageKind.grid, 5), (ImageKind.simple, 8), (ImageKind.match3, 8)],
+)
+def test_models_see_images_through_an_encoder_of_ours(encoder: ImageKind, kernel: int) -> None:
+    """The policy's, where that is one of ours; else the default one, as checkpoints have it."""
+    rewards = RewardsConfig(
+        curiosity=CuriosityConfig(strength=0.1),
+        rnd=RNDConfig(strength=0.1),
+        gail=GAILConfig(strength=0.1, demos=["some.demo"]),
+    )
+    obs = ObsLayout.from_shapes([[3], [6, 20, 20]])
+    models = make_models(obs, ActionLayout(0, (2,)), rewards, images=encoder)
+    assert set(models) == {"curiosity", "rnd", "gail"}
+    for model in models.values():
+        first = next(layer for layer in model.modules() if isinstance(layer, torch.nn.Conv2d))
+        assert first.kernel_size == (kernel, kernel)
 
 
 @pytest.mark.parametrize("kind", [Curiosity, RandomNetwork])

@@ -83,7 +83,7 @@ def _make_learner(
 
     # a value for each stream of rewards
     judged = expert(rewards.gail.demos) if rewards.gail.strength else None
-    intrinsic = make_intrinsic(obs, layout, rewards, cfg, judged)
+    intrinsic = make_intrinsic(obs, layout, rewards, cfg, judged, model.image_encoder)
     critic = make_critic(obs, team_size, model, layout, 1 + len(intrinsic)).to(cfg.device)
     shares = model.critic is CriticKind.poca and team_size > 1
     streams = RewardStreams(ppo, rewards, intrinsic, obs.keys, shares)

@@ -74,7 +74,7 @@ def check_network_memory(
     """Raise ConfigError if a policy's networks do not fit into the memory that is free."""
     with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers
         nets = make_actor(obs, layout, team_size, cfg), make_critic(obs, team_size, cfg, layout)
-        streams = make_models(obs, layout, rewards)
+        streams = make_models(obs, layout, rewards, images=cfg.image_encoder)
 
     for stream, model in streams.items():
         size, hidden = _weights(model), list(rewards.intrinsic[stream].hidden)

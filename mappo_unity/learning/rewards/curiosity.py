@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
-from mappo_unity.config.schema import Activation, CuriosityConfig
+from mappo_unity.config.schema import Activation, CuriosityConfig, ImageKind
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
 from mappo_unity.learning.networks.mlp import ACTIVATIONS, make_mlp
@@ -29,15 +29,22 @@ class Curiosity(nn.Module):
         obs: the observation entries of an agent.
         layout: the sizes of its action.
         cfg: the stream's options.
+        images: their encoder.
     """
 
-    def __init__(self, obs: ObsLayout, layout: ActionLayout, cfg: CuriosityConfig) -> None:
+    def __init__(
+        self,
+        obs: ObsLayout,
+        layout: ActionLayout,
+        cfg: CuriosityConfig,
+        images: ImageKind = ImageKind.auto,
+    ) -> None:
         super().__init__()
         self.layout = layout
         *hidden, width = list(cfg.hidden)
         actions = layout.continuous + sum(layout.branches)
 
-        self.encoder = Encoder(obs, normalize=True)
+        self.encoder = Encoder(obs, normalize=True, kind=images)
         self.body = nn.Sequential(
             make_mlp(self.encoder.size, hidden, width, Activation.silu, last_gain=2**0.5),
             ACTIVATIONS[Activation.silu](),

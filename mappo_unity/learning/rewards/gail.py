@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from mappo_unity.config.schema import Activation, GAILConfig
+from mappo_unity.config.schema import Activation, GAILConfig, ImageKind
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
@@ -32,14 +32,22 @@ class Discriminator(nn.Module):
         layout: the sizes of its action.
         cfg: the stream's options.
         expert: the demonstrations; None: it has only a shape.
+        images: their encoder.
     """
 
     beta: Tensor
 
-    def __init__(self, obs: ObsLayout, layout: ActionLayout, cfg: GAILConfig, expert: Expert | None) -> None:
+    def __init__(
+        self,
+        obs: ObsLayout,
+        layout: ActionLayout,
+        cfg: GAILConfig,
+        expert: Expert | None,
+        images: ImageKind = ImageKind.auto,
+    ) -> None:
         super().__init__()
         self.layout, self.cfg, self.expert = layout, cfg, expert
-        self.encoder = Encoder(obs, normalize=True)
+        self.encoder = Encoder(obs, normalize=True, kind=images)
         # ends stand beside actions, as in ML-Agents
         extra = layout.continuous + sum(layout.branches) + 1 if cfg.use_actions else 0
         *hidden, width = list(cfg.hidden)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from mappo_unity.config.schema import Activation, RNDConfig
+from mappo_unity.config.schema import Activation, ImageKind, RNDConfig
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
 from mappo_unity.learning.networks.mlp import make_mlp
@@ -22,12 +22,15 @@ class RandomNetwork(nn.Module):
         obs: the observation entries of an agent.
         layout: not looked at.
         cfg: the stream's options.
+        images: their encoder.
     """
 
-    def __init__(self, obs: ObsLayout, layout: ActionLayout, cfg: RNDConfig) -> None:
+    def __init__(
+        self, obs: ObsLayout, layout: ActionLayout, cfg: RNDConfig, images: ImageKind = ImageKind.auto
+    ) -> None:
         super().__init__()
-        self.target = _Network(obs, list(cfg.hidden))
-        self.predictor = _Network(obs, list(cfg.hidden))
+        self.target = _Network(obs, list(cfg.hidden), images)
+        self.predictor = _Network(obs, list(cfg.hidden), images)
         self.target.requires_grad_(False)
 
     def rewards(self, decisions: Transitions) -> Tensor:
@@ -41,9 +44,9 @@ class RandomNetwork(nn.Module):
 
 
 class _Network(nn.Module):
-    def __init__(self, obs: ObsLayout, hidden: list[int]) -> None:
+    def __init__(self, obs: ObsLayout, hidden: list[int], images: ImageKind) -> None:
         super().__init__()
-        self.encoder = Encoder(obs, normalize=True)
+        self.encoder = Encoder(obs, normalize=True, kind=images)
         self.net = make_mlp(self.encoder.size, hidden, hidden[-1], Activation.silu, last_gain=2**0.5)
 
     def forward(self, obs: list[Tensor]) -> Tensor:

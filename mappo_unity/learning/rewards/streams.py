@@ -14,12 +14,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from mappo_unity import keys
-from mappo_unity.config.schema import Config, IntrinsicConfig, PPOConfig, RewardsConfig
+from mappo_unity.config.schema import Config, ImageKind, IntrinsicConfig, PPOConfig, RewardsConfig
 from mappo_unity.learning.advantage import share_left
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout, RunningNorm, running_norms
+from mappo_unity.learning.networks.images import OURS
 from mappo_unity.learning.rewards.curiosity import Curiosity
 from mappo_unity.learning.rewards.gail import Discriminator
 from mappo_unity.learning.rewards.rnd import RandomNetwork
@@ -195,7 +196,12 @@ class RewardStreams:
 
 
 def make_intrinsic(
-    obs: ObsLayout, layout: ActionLayout, cfg: RewardsConfig, run: Config, expert: Expert | None = None
+    obs: ObsLayout,
+    layout: ActionLayout,
+    cfg: RewardsConfig,
+    run: Config,
+    expert: Expert | None = None,
+    images: ImageKind = ImageKind.auto,
 ) -> list[IntrinsicStream]:
     """Build the intrinsic streams that are on.
 
@@ -204,8 +210,9 @@ def make_intrinsic(
         cfg: the streams' options.
         run: the options of the run: its device and its length.
         expert: the demonstrations, where GAIL is on.
+        images: the encoder of the policy's images.
     """
-    models = make_models(obs, layout, cfg, expert)
+    models = make_models(obs, layout, cfg, expert, images)
     return [
         IntrinsicStream(name, model.to(run.device), cfg.intrinsic[name], run.max_steps)
         for name, model in models.items()
@@ -213,14 +220,22 @@ def make_intrinsic(
 
 
 def make_models(
-    obs: ObsLayout, layout: ActionLayout, cfg: RewardsConfig, expert: Expert | None = None
+    obs: ObsLayout,
+    layout: ActionLayout,
+    cfg: RewardsConfig,
+    expert: Expert | None = None,
+    images: ImageKind = ImageKind.auto,
 ) -> dict[str, nn.Module]:
-    """Build the models of the streams that are on; GAIL's learns only with an expert."""
+    """Build the models of the streams that are on; GAIL's learns only with an expert.
+
+    They see images as the policy does where that takes an encoder of ours, else through `ImageKind.auto`.
+    """
+    seen = images if images in OURS else ImageKind.auto
     models: dict[str, nn.Module] = {}
     if "curiosity" in cfg.intrinsic:
-        models["curiosity"] = Curiosity(obs, layout, cfg.curiosity)
+        models["curiosity"] = Curiosity(obs, layout, cfg.curiosity, seen)
     if "rnd" in cfg.intrinsic:
-        models["rnd"] = RandomNetwork(obs, layout, cfg.rnd)
+        models["rnd"] = RandomNetwork(obs, layout, cfg.rnd, seen)
     if "gail" in cfg.intrinsic:
-        models["gail"] = Discriminator(obs, layout, cfg.gail, expert)
+        models["gail"] = Discriminator(obs, layout, cfg.gail, expert, seen)
     return models
