@@ -17,12 +17,12 @@ from pathlib import Path
 
 from mlagents_envs.base_env import BehaviorSpec
 
-from mappo_unity.config.option_table import show_value
 from mappo_unity.errors import ConfigError
 from mappo_unity.keys import policy_name
 from mappo_unity.policies.warm_start.actors import actor_from_onnx
 from mappo_unity.policies.warm_start.agreement import TOLERANCE, check_agreement
 from mappo_unity.policies.warm_start.onnx_network import read_network
+from mappo_unity.policies.warm_start.start import show_options
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.registry import scene_names
 
@@ -74,8 +74,7 @@ def compare(path: Path, spec: BehaviorSpec) -> tuple[str, float]:
     """
     actor, network = actor_from_onnx(path, spec), read_network(path)
     sensors = [list(sensor.shape) for sensor in spec.observation_specs]
-    told = " ".join(f"{name}={show_value(value)}" for name, value in network.options.items())
-    return told, check_agreement(network, actor[0].module, sensors)
+    return show_options(network.options), check_agreement(network, actor[0].module, sensors)
 
 
 if __name__ == "__main__":

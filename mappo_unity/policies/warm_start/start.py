@@ -68,13 +68,14 @@ def _from_onnx(path: Path, learner: PolicyLearner, layout: Mapping[str, Any]) ->
     network = read_network(path)
     rows, error = copy_network(network, learner.actor, layout["sensors"])
 
-    told = f"{path}, whose network has {_show(network.options)}"
+    told = f"{path}, whose network has {show_options(network.options)}"
     if error is not None:
         told += f"; on random observations its actions differ from onnxruntime's by {error:.1e}"
     return told, [*rows, Row("critic", None, "an ONNX file holds none: a new one learns")]
 
 
-def _show(options: Mapping[str, Any]) -> str:
+def show_options(options: Mapping[str, Any]) -> str:
+    """Return the options of a network as a line of `name=value`."""
     return " ".join(f"{name}={show_value(value)}" for name, value in options.items())
 
 
