@@ -11,7 +11,7 @@ from mlagents_envs.base_env import ActionSpec, BehaviorSpec
 
 from mappo_unity import load_policy
 from mappo_unity.cli import eval_main, play_main, train_main
-from mappo_unity.config.schema import BCConfig, GAILConfig, MemoryKind, ModelConfig, PPOConfig
+from mappo_unity.config.schema import BCConfig, GAILConfig, MemoryKind, ModelConfig, Optimizer, PPOConfig
 from mappo_unity.learning.imitation.cloning import Cloning, _cut
 from mappo_unity.learning.imitation.expert import Expert, make_expert
 from mappo_unity.learning.networks.actor_critic import UnityActor, make_actor
@@ -121,6 +121,21 @@ def test_states_before_pieces_are_those_of_the_whole_episode() -> None:
         assert torch.allclose(states[number], state[0], atol=1e-6)
         state = actor[0].module(table[row : row + 1], state)[1].detach()
     assert not states[9].any()  # the second episode begins anew
+
+
+@pytest.mark.parametrize("kind", Optimizer)
+def test_weight_decay_holds_in_cloning_too(kind: Optimizer) -> None:
+    spec = ActionSpec(0, (2,))
+    demo = demonstration(spec)
+    sizes = []
+    for decay in (0.0, 5.0):
+        actor = actor_of(spec)
+        ppo = PPOConfig(lr=1e-2, minibatch_size=32, epochs=2, optimizer=kind, weight_decay=decay)
+        cloning = Cloning(actor, make_expert(demo, ["observation"], "cpu"), BCConfig(demos=["x"]), ppo)
+        for _ in range(20):
+            cloning.learn(60, 1e-2, 0.0)
+        sizes.append(sum(float(weights.detach().square().sum()) for weights in actor.parameters()))
+    assert sizes[1] < 0.5 * sizes[0]
 
 
 def test_episodes_are_cut_into_pieces() -> None:

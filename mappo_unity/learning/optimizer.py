@@ -24,9 +24,13 @@ def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch
 
     Its fused form makes one pass over all parameters.
     """
-    kind = torch.optim.AdamW if cfg.optimizer is Optimizer.adamw else torch.optim.Adam
     groups = [{"params": list(net.parameters())} for net in (actor, critic)]
-    return kind(groups, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=cfg.optimizer_eps, fused=True)
+    return kind_of(cfg)(groups, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=cfg.optimizer_eps, fused=True)
+
+
+def kind_of(cfg: PPOConfig) -> type[torch.optim.Adam]:
+    """Return the class that ppo.optimizer names."""
+    return torch.optim.AdamW if cfg.optimizer is Optimizer.adamw else torch.optim.Adam
 
 
 class LearningRates:

@@ -18,6 +18,7 @@ from mappo_unity.learning.advantage import share_left
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import ActionDistribution
+from mappo_unity.learning.optimizer import kind_of
 
 
 class Cloning:
@@ -27,7 +28,8 @@ class Cloning:
         actor: learns.
         expert: what it learns from.
         cfg: strength, and whether nothing else teaches the actor.
-        ppo: epochs, minibatches and, with a memory, the length of sequences.
+        ppo: epochs, minibatches, the optimizer's kind and weight decay and, with a memory, the length of
+            sequences.
         max_steps: agent decisions of the run.
     """
 
@@ -36,7 +38,8 @@ class Cloning:
     ) -> None:
         self._actor, self._expert, self.cfg, self._ppo = actor, expert, cfg, ppo
         self._max_steps = max_steps
-        self.optimizer = torch.optim.Adam(actor.parameters(), lr=ppo.lr)
+        # epsilon stays torch's: cloned gradients are not those that ppo.optimizer_eps is for
+        self.optimizer = kind_of(ppo)(actor.parameters(), lr=ppo.lr, weight_decay=ppo.weight_decay)
         self._pieces = _cut(expert.first, ppo.sequence_length if actor.has_memory else 1)
 
     def learn(self, decisions: int, lr: float, progress: float) -> dict[str, float]:
