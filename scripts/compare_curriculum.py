@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from decisions_to import EPISODES, Metrics
+from decisions_to import Metrics, columns_of, reached_cells, with_value
 from learn_scene import append, mappo_eval, read_rows
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
@@ -88,17 +88,13 @@ def measure(arguments: argparse.Namespace, way: Way, seed: int) -> None:
     train(SCENE, seed, folder, arguments.minutes, [*way.options, "update_threads=1"])
 
     metrics = read_metrics(folder / "metrics.csv")
-    first = first_at_both(metrics, BENCHMARK)
     said = mappo_eval(f"run={folder}", f"episodes={arguments.episodes}", "deterministic=false", *FULL_HEIGHT)
     small, big = (figures_of(said, behavior) for behavior in BEHAVIORS)
     row = {
         "date": time.strftime("%Y-%m-%d"),
         "way": way.key,
         "seed": seed,
-        "reached": int(first["agent_steps"]) if first else "",
-        "reached_minutes": f"{first['wall_s'] / 60:.1f}" if first else "",
-        "decisions": int(metrics[-1]["agent_steps"]),
-        "minutes": f"{metrics[-1]['wall_s'] / 60:.1f}",
+        **columns_of(metrics, first_at_both(metrics, BENCHMARK)),
         "small": f"{small['mean_return']:.4g}",
         "small_stderr": f"{small['stderr']:.2g}",
         "big": f"{big['mean_return']:.4g}",
@@ -115,7 +111,8 @@ def first_at_both(metrics: Metrics, goal: float) -> dict[str, int | float] | Non
 
     A return counts from the 100th episode on, as in decisions_to.
     """
-    return next((row for row in metrics if has_full_height(row) and stands_at(row, goal)), None)
+    rows = with_value(metrics, "return_mean")
+    return next((row for row in rows if has_full_height(row) and stands_at(row, goal)), None)
 
 
 def has_full_height(row: dict[str, int | float]) -> bool:
@@ -127,7 +124,7 @@ def has_full_height(row: dict[str, int | float]) -> bool:
 def stands_at(row: dict[str, int | float], goal: float) -> bool:
     """Return whether both behaviors' mean returns are at least `goal`."""
     returns = [row.get(f"{behavior}?team=0/return_mean", math.nan) for behavior in BEHAVIORS]
-    return row.get("episodes", 0) >= EPISODES and all(value >= goal for value in returns)
+    return all(value >= goal for value in returns)
 
 
 def figures_of(said: dict[str, Any], behavior: str) -> dict[str, Any]:
@@ -157,8 +154,7 @@ def cells(row: dict[str, str]) -> list[str]:
     """Return a run's cells: seed, decisions and minutes to the benchmarks, returns, decisions in all."""
     return [
         row["seed"],
-        f"{int(row['reached']) / 1e6:.2f} M" if row["reached"] else "never",
-        f"{float(row['reached_minutes']):.0f}" if row["reached"] else "-",
+        *reached_cells(row),
         f"{float(row['small']):.3f}, {float(row['big']):.3f}",
         f"{int(row['decisions']) / 1e6:.2f} M",
     ]

@@ -20,7 +20,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from decisions_to import first_at
+from decisions_to import columns_of, first_at, reached_cells
 from learn_scene import append, mappo_eval, read_rows
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
@@ -117,17 +117,13 @@ def measure(arguments: argparse.Namespace, signal: Signal, seed: int) -> None:
     learn(arguments, signal, seed, folder)
 
     metrics = read_metrics(folder / "metrics.csv")
-    first = first_at(metrics, BENCHMARK[signal.scene])
     said = mappo_eval(f"run={folder}", f"episodes={arguments.episodes}", "deterministic=false")
     row = {
         "date": time.strftime("%Y-%m-%d"),
         "scene": signal.scene,
         "signal": signal.key,
         "seed": seed,
-        "reached": int(first["agent_steps"]) if first else "",
-        "reached_minutes": f"{first['wall_s'] / 60:.1f}" if first else "",
-        "decisions": int(metrics[-1]["agent_steps"]),
-        "minutes": f"{metrics[-1]['wall_s'] / 60:.1f}",
+        **columns_of(metrics, first_at(metrics, BENCHMARK[signal.scene])),
         "value": f"{said['mean_return']:.4g}",
         "stderr": f"{said['stderr']:.2g}",
         "episodes": arguments.episodes,
@@ -184,8 +180,7 @@ def cells(rows: list[dict[str, str]]) -> list[str]:
     mean = f"**{statistics.mean(values):.2f}** ({', '.join(f'{value:.2f}' for value in values)})"
     return [
         ", ".join(row["seed"] for row in rows),
-        ", ".join(f"{int(row['reached']) / 1e6:.2f} M" if row["reached"] else "never" for row in rows),
-        ", ".join(f"{float(row['reached_minutes']):.0f}" if row["reached"] else "-" for row in rows),
+        *map(", ".join, zip(*map(reached_cells, rows))),
         mean if len(values) > 1 else f"{values[0]:.2f}",
         ", ".join(f"{int(row['decisions']) / 1e6:.2f} M" for row in rows),
     ]

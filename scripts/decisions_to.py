@@ -55,6 +55,23 @@ def with_value(metrics: Metrics, metric: str) -> Metrics:
     ]
 
 
+def columns_of(metrics: Metrics, reached: dict[str, int | float] | None) -> dict[str, object]:
+    """Return what a CSV file says of a run: decisions and minutes until a row was reached, and in all."""
+    return {
+        "reached": int(reached["agent_steps"]) if reached else "",
+        "reached_minutes": f"{reached['wall_s'] / 60:.1f}" if reached else "",
+        "decisions": int(metrics[-1]["agent_steps"]),
+        "minutes": f"{metrics[-1]['wall_s'] / 60:.1f}",
+    }
+
+
+def reached_cells(row: dict[str, str]) -> tuple[str, str]:
+    """Return decisions and minutes until a row was reached, of a file with `columns_of`, for a table."""
+    if not row["reached"]:
+        return "never", "-"
+    return f"{int(row['reached']) / 1e6:.2f} M", f"{float(row['reached_minutes']):.0f}"
+
+
 def row(run: Path, goal: float, metric: str) -> str:
     """Return a run's row of the table."""
     metrics = read_metrics(run / "metrics.csv")

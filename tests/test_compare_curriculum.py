@@ -52,6 +52,7 @@ def row(small: float, big: float, episodes: int = 200, **lessons: int) -> dict[s
     """Return a row of metrics: both mean returns, and lessons by the parameter's name."""
     return {
         "episodes": episodes,
+        "return_mean": (small + big) / 2,
         "SmallWallJump?team=0/return_mean": small,
         "BigWallJump?team=0/return_mean": big,
         **{f"lesson/{name}": number for name, number in lessons.items()},

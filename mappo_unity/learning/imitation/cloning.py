@@ -38,7 +38,7 @@ class Cloning:
     ) -> None:
         self._actor, self._expert, self.cfg, self._ppo = actor, expert, cfg, ppo
         self._max_steps = max_steps
-        # epsilon stays torch's: cloned gradients are not those that ppo.optimizer_eps is for
+        # epsilon stays torch's, as in ML-Agents
         self.optimizer = kind_of(ppo)(actor.parameters(), lr=ppo.lr, weight_decay=ppo.weight_decay)
         self._pieces = _cut(expert.first, ppo.sequence_length if actor.has_memory else 1)
 
