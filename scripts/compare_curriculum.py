@@ -17,10 +17,10 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from decisions_to import Metrics, columns_of, reached_cells, with_value
 from learn_scene import append, mappo_eval, read_rows
+from score_measures import behavior_return
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
 
@@ -89,16 +89,16 @@ def measure(arguments: argparse.Namespace, way: Way, seed: int) -> None:
 
     metrics = read_metrics(folder / "metrics.csv")
     said = mappo_eval(f"run={folder}", f"episodes={arguments.episodes}", "deterministic=false", *FULL_HEIGHT)
-    small, big = (figures_of(said, behavior) for behavior in BEHAVIORS)
+    small, big = (behavior_return(behavior)(said) for behavior in BEHAVIORS)
     row = {
         "date": time.strftime("%Y-%m-%d"),
         "way": way.key,
         "seed": seed,
         **columns_of(metrics, first_at_both(metrics, BENCHMARK)),
-        "small": f"{small['mean_return']:.4g}",
-        "small_stderr": f"{small['stderr']:.2g}",
-        "big": f"{big['mean_return']:.4g}",
-        "big_stderr": f"{big['stderr']:.2g}",
+        "small": f"{small[0]:.4g}",
+        "small_stderr": f"{small[1]:.2g}",
+        "big": f"{big[0]:.4g}",
+        "big_stderr": f"{big[1]:.2g}",
         "episodes": arguments.episodes,
         "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
     }
@@ -125,12 +125,6 @@ def stands_at(row: dict[str, int | float], goal: float) -> bool:
     """Return whether both behaviors' mean returns are at least `goal`."""
     returns = [row.get(f"{behavior}?team=0/return_mean", math.nan) for behavior in BEHAVIORS]
     return all(value >= goal for value in returns)
-
-
-def figures_of(said: dict[str, Any], behavior: str) -> dict[str, Any]:
-    """Return a behavior's figures of what mappo-eval said."""
-    figures: dict[str, Any] = said["behaviors"][f"{behavior}?team=0"]
-    return figures
 
 
 def rows_of(way: Way) -> list[dict[str, str]]:

@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 import compare_curriculum
 from compare_curriculum import BENCHMARK, FULL_HEIGHT, LAST_LESSON, WAYS, Way, first_at_both
 from learn_scene import append
+from pages import assert_page_is_written
 
 WITHOUT, WITH = WAYS
 
@@ -21,13 +22,7 @@ WITHOUT, WITH = WAYS
 def test_the_table_of_the_page_is_that_of_the_measured_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    page = tmp_path / "WallJump.md"
-    page.write_text(compare_curriculum.PAGE.read_text(encoding="utf-8"))
-    monkeypatch.setattr(compare_curriculum, "PAGE", page)
-    compare_curriculum.write_page()
-
-    written = (compare_curriculum.ROOT / "docs/scenes/WallJump.md").read_text(encoding="utf-8")
-    assert page.read_text() == written, "python scripts/compare_curriculum.py --draw writes it anew"
+    assert_page_is_written(compare_curriculum, tmp_path, monkeypatch)
 
 
 def test_the_walls_of_the_last_lesson_are_those_that_are_evaluated() -> None:

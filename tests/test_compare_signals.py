@@ -13,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 import compare_signals
 from compare_signals import SIGNALS, Signal
 from learn_scene import append
+from pages import assert_page_is_written
 
 PRESET = Signal("Hallway", "none", "the preset")
 
@@ -20,13 +21,7 @@ PRESET = Signal("Hallway", "none", "the preset")
 def test_the_table_of_the_page_is_that_of_the_measured_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    page = tmp_path / "rewards.md"
-    page.write_text(compare_signals.PAGE.read_text(encoding="utf-8"))
-    monkeypatch.setattr(compare_signals, "PAGE", page)
-    compare_signals.write_page()
-
-    written = (compare_signals.ROOT / "docs/rewards.md").read_text(encoding="utf-8")
-    assert page.read_text() == written, "python scripts/compare_signals.py --draw writes it anew"
+    assert_page_is_written(compare_signals, tmp_path, monkeypatch)
 
 
 def test_options_of_every_signal_are_taken_by_its_scene() -> None:
