@@ -74,18 +74,31 @@ def test_without_smoothing_the_mean_itself_counts_and_group_rewards_do_not() -> 
     lessons = Lessons(parameters(*raw), {"A": 2})
     assert lessons.notes == [
         "note: env.params.level.lessons[0].completion measures the individual rewards of A, as ML-Agents "
-        "does; what its agents earn as a group does not count"
+        "does; what its agents earn as a group does not count (measure: group_reward)"
     ]
     assert lessons.advance(episodes(4, 6, group=100), 0.0) == []
     assert len(lessons.advance(episodes(7), 0.0)) == 1
 
 
-@pytest.mark.parametrize("measure", ["progress", "reward"])
+def test_a_group_can_be_measured_by_what_it_earns_together() -> None:
+    raw = two(measure="group_reward", threshold=5, signal_smoothing=False, min_lesson_length=2)
+    lessons, resumed = (Lessons(parameters(*raw), {"A": 2}) for _ in range(2))
+    assert lessons.notes == []
+    assert lessons.advance(episodes(100, 100, group=4), 0.0) == []
+
+    resumed.load_state_dict(lessons.state_dict())
+    assert resumed.state_dict() == lessons.state_dict()
+    for going in (lessons, resumed):  # of 4 and 4 the newer one stays beside 6.5: 5.25
+        assert len(going.advance(episodes(-100, group=6.5), 0.0)) == 1
+        assert going.state_dict()["group_returns"] == {"A": []}
+
+
+@pytest.mark.parametrize("measure", ["progress", "reward", "group_reward"])
 def test_so_many_episodes_must_have_ended_first(measure: str) -> None:
     lessons = Lessons(parameters(*two(measure=measure, threshold=0.1, min_lesson_length=3)), {"A": 1})
     nobody = {"A?team=0": [Episode(0, 9.0, 0.0, 0, False)]}  # ended without a decision
-    assert lessons.advance(episodes(9, 9), 0.9) == [] and lessons.advance(nobody, 0.9) == []
-    assert len(lessons.advance(episodes(9), 0.9)) == 1
+    assert lessons.advance(episodes(9, 9, group=9), 0.9) == [] and lessons.advance(nobody, 0.9) == []
+    assert len(lessons.advance(episodes(9, group=9), 0.9)) == 1
 
 
 def test_a_change_empties_the_windows_of_all_and_the_smoothed_value_stays() -> None:

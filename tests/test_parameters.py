@@ -109,7 +109,7 @@ def completed(**completion: Any) -> dict[str, Any]:
         (lessons({"value": {"sampler": "x"}}), "env.params.x.lessons[0].value.sampler=x does not exist"),
         (
             completed(measure="rewards"),
-            "completion.measure=rewards does not exist; choices: progress, reward",
+            "completion.measure=rewards does not exist; choices: progress, reward, group_reward",
         ),
         (completed(measure="progress", threshold=1.5), "completion.threshold=1.5 is out of range"),
         (completed(measure="progress", threshold=-0.1), "it must be from 0 to 1"),

@@ -14,7 +14,8 @@ from mappo_unity.config.parameters.samplers import Value, check_keys, read_numbe
 from mappo_unity.errors import ConfigError
 
 LESSONS = "lessons"
-PROGRESS, REWARD = "progress", "reward"
+PROGRESS, REWARD, GROUP_REWARD = "progress", "reward", "group_reward"
+MEASURES = PROGRESS, REWARD, GROUP_REWARD  # ML-Agents has the first two
 
 _SPELLINGS = {"curriculum": LESSONS, "completion_criteria": "completion"}
 _LESSON_KEYS = ("name", "value", "completion")
@@ -32,7 +33,8 @@ class Completion:
     behavior: str | None
     """Policy name whose episodes count; None: the only one there is."""
     measure: str
-    """PROGRESS: the share of the run's max_steps that is done; REWARD: the mean return of new episodes."""
+    """PROGRESS: the share of the run's max_steps that is done; REWARD: the mean return of new episodes, what
+    agents earn by themselves; GROUP_REWARD: what they earn as a group."""
     threshold: float
     """What the measure must be above."""
     min_lesson_length: int
@@ -127,9 +129,9 @@ def _completion(where: str, raw: Any) -> Completion:
         raise ConfigError(f"{where}.behavior={show_value(behavior)} must be a behavior's name")
 
     measure = raw.get("measure", REWARD)
-    if measure not in (PROGRESS, REWARD):
+    if measure not in MEASURES:
         raise ConfigError(
-            f"{where}.measure={show_value(measure)} does not exist; choices: {PROGRESS}, {REWARD}"
+            f"{where}.measure={show_value(measure)} does not exist; choices: {', '.join(MEASURES)}"
         )
 
     threshold = read_number(f"{where}.threshold", raw.get("threshold", 0.0))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mappo_unity import keys
-from mappo_unity.config.parameters.curriculum import PROGRESS, REWARD, Completion, Lesson
+from mappo_unity.config.parameters.curriculum import GROUP_REWARD, PROGRESS, REWARD, Completion, Lesson
 from mappo_unity.config.parameters.samplers import Sampler, Value
 from mappo_unity.config.parameters.values import curricula, show_parameter, values_at
 from mappo_unity.config.schema import EnvConfig
@@ -64,9 +64,7 @@ class Lessons:
         self.numbers = dict.fromkeys(self._curricula, 0)
         self.notes = list(self._make_notes(team_sizes))
         self._smoothed = dict.fromkeys(self._curricula, 0.0)
-        self._returns: dict[str, deque[float]] = {
-            policy: deque(maxlen=self._window(policy)) for policy in team_sizes
-        }
+        self._windows = {measure: self._make_windows(team_sizes) for measure in (REWARD, GROUP_REWARD)}
 
     @property
     def are_last(self) -> bool:
@@ -97,18 +95,20 @@ class Lessons:
         with_news = set()
         for behavior, finished in episodes.items():
             policy = keys.policy_name(behavior)
-            # the individual return alone, as in ML-Agents; an episode without a decision says nothing
-            returns = [episode.individual_return for episode in finished if episode.length]
-            self._returns[policy].extend(returns)
-            if returns:
+            # an episode without a decision says nothing
+            counted = [episode for episode in finished if episode.length]
+            self._windows[REWARD][policy].extend(episode.individual_return for episode in counted)
+            self._windows[GROUP_REWARD][policy].extend(episode.group_return for episode in counted)
+            if counted:
                 with_news.add(policy)
 
         changes = [self._next(name) for name in self.numbers if self._is_complete(name, progress, with_news)]
         for change in changes:
             self.numbers[change.name] = change.number
         if changes:  # the episodes of other conditions say nothing about the new ones
-            for window in self._returns.values():
-                window.clear()
+            for windows in self._windows.values():
+                for window in windows.values():
+                    window.clear()
         return changes
 
     def state_dict(self) -> dict[str, Any]:
@@ -116,7 +116,8 @@ class Lessons:
         return {
             "numbers": dict(self.numbers),
             "smoothed": dict(self._smoothed),
-            "returns": {policy: list(window) for policy, window in self._returns.items()},
+            "returns": _listed(self._windows[REWARD]),
+            "group_returns": _listed(self._windows[GROUP_REWARD]),
             "are_last": self.are_last,
             "values": self._shown(),
         }
@@ -132,9 +133,10 @@ class Lessons:
             if name in self.numbers:
                 self.numbers[name] = min(number, self._last(name))
                 self._smoothed[name] = state["smoothed"][name]
-        for policy, returns in state.get("returns", {}).items():
-            if policy in self._returns:
-                self._returns[policy].extend(returns)
+        for measure, entry in ((REWARD, "returns"), (GROUP_REWARD, "group_returns")):
+            for policy, returns in state.get(entry, {}).items():
+                if policy in self._windows[measure]:
+                    self._windows[measure][policy].extend(returns)
 
         before, now = state.get("values", {}), self._shown()
         changed = [name for name in self._parameters if before.get(name) != now.get(name)]
@@ -151,11 +153,11 @@ class Lessons:
         if self.numbers[name] == self._last(name) or completion is None:
             return False
 
-        policy = self._policy(completion)
-        window = self._returns[policy]
+        policy, measured = self._policy(completion), completion.measure
+        window = self._windows[REWARD if measured == PROGRESS else measured][policy]
         if len(window) < completion.min_lesson_length:
             return False
-        if completion.measure == PROGRESS:
+        if measured == PROGRESS:
             return progress > completion.threshold
 
         if policy not in with_news:
@@ -175,7 +177,7 @@ class Lessons:
         return len(self._curricula[name].lessons) - 1
 
     def _policy(self, completion: Completion) -> str:
-        return completion.behavior or next(iter(self._returns))
+        return completion.behavior or next(iter(self._windows[REWARD]))
 
     def _completions(self) -> Iterable[tuple[str, Completion]]:
         """Yield every completion with the option that says it."""
@@ -183,6 +185,9 @@ class Lessons:
             for number, lesson in enumerate(curriculum.lessons):
                 if lesson.completion is not None:
                     yield f"env.params.{name}.lessons[{number}].completion", lesson.completion
+
+    def _make_windows(self, policies: Iterable[str]) -> dict[str, deque[float]]:
+        return {policy: deque(maxlen=self._window(policy)) for policy in policies}
 
     def _window(self, policy: str) -> int:
         """Return how many returns of a policy are kept: what its most demanding lesson asks for."""
@@ -212,8 +217,12 @@ class Lessons:
             if completion.measure == REWARD and team_sizes[policy] > 1:
                 yield (
                     f"note: {where} measures the individual rewards of {policy}, as ML-Agents does; what its "
-                    "agents earn as a group does not count"
+                    f"agents earn as a group does not count (measure: {GROUP_REWARD})"
                 )
+
+
+def _listed(windows: Mapping[str, deque[float]]) -> dict[str, list[float]]:
+    return {policy: list(window) for policy, window in windows.items()}
 
 
 def lessons_of(cfg: EnvConfig, env: Played) -> Lessons:
