@@ -40,8 +40,23 @@ def test_the_first_few_episodes_to_end_are_no_score():
     assert window.score() == -math.inf and window.summary()["return_mean"] == 1.0
     window.add({"Left": [], "Right": ended(0.0)})  # behaviors count together: one may never ask again
     assert window.score() == 0.75
-    window.forget()
-    assert window.score() == -math.inf
+
+
+def test_the_first_episodes_of_a_lesson_are_no_score_either():
+    """Those that began before it, and the short ones among the others, have left the window by then."""
+    window = RecentEpisodes(2, ["Left"])
+    window.add({"Left": ended(5.0, 5.0)})
+    window.begin_anew()
+    assert window.score() == -math.inf and math.isnan(window.summary()["return_mean"])
+
+    window.add({"Left": ended(9.0, 9.0, 1.0)})
+    assert window.summary()["return_mean"] == 5.0, "it is shown"
+    assert window.score() == -math.inf and not window.reached(0.0), "but chooses and ends nothing"
+    resumed = RecentEpisodes(2, ["Left"])
+    resumed.load_state_dict(window.state_dict())
+    for one in (window, resumed):
+        one.add({"Left": ended(3.0)})
+        assert one.score() == 2.0 and one.reached(2.0)
 
 
 def test_the_window_s_standard_error():

@@ -12,11 +12,14 @@ from mappo_unity.envs.rounds import Episode
 
 
 class RecentEpisodes:
-    """The newest finished episodes of every behavior."""
+    """The newest finished episodes of every behavior.
+
+    Attributes: `total`, of the run; `early`, how many are still to end before the window counts.
+    """
 
     def __init__(self, size: int, behaviors: list[str]) -> None:
         self.size = size
-        self.total = 0
+        self.total = self.early = 0
         self.recent: dict[str, deque[tuple[float, float, int]]] = {b: deque(maxlen=size) for b in behaviors}
 
     def add(self, episodes: dict[str, list[Episode]]) -> int:
@@ -31,17 +34,23 @@ class RecentEpisodes:
                     count += 1
 
         self.total += count
+        self.early = max(0, self.early - count)
         return count
 
-    def forget(self) -> None:
-        """Empty the window; the total stays."""
+    def begin_anew(self) -> None:
+        """Empty the window, as a lesson has changed; the total stays.
+
+        The next episodes to end, as many as the window holds twice, began before the change or are the short
+        ones among those that began after it: no sample of the new lesson until the first half has left again.
+        """
         for rows in self.recent.values():
             rows.clear()
+        self.early = 2 * self.size
 
     @property
     def full(self) -> bool:
-        """Whether every behavior has as many episodes as the window holds."""
-        return all(len(rows) == self.size for rows in self.recent.values())
+        """Whether every behavior has as many episodes as the window holds, and none is an early one."""
+        return not self.early and all(len(rows) == self.size for rows in self.recent.values())
 
     def reached(self, goal: float) -> bool:
         """Return whether the mean return over a full window is at least `goal`."""
@@ -52,7 +61,8 @@ class RecentEpisodes:
 
         The first to end are no sample: where success ends an episode, they are those that met it by luck.
         """
-        return self.summary()["return_mean"] if len(self._rows()) >= self.size else -math.inf
+        counts = not self.early and len(self._rows()) >= self.size
+        return self.summary()["return_mean"] if counts else -math.inf
 
     def standard_error(self) -> float:
         """Return that of the mean return, 0 of no episodes; team mates, who earn the same, count each."""
@@ -79,12 +89,13 @@ class RecentEpisodes:
         """Return everything that resuming needs."""
         return {
             "total": self.total,
+            "early": self.early,
             "recent": {b: [list(r) for r in rows] for b, rows in self.recent.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from what `state_dict` returned."""
-        self.total = int(state["total"])
+        self.total, self.early = int(state["total"]), int(state.get("early", 0))  # since 0.3
         for behavior, rows in state["recent"].items():
             self.recent[behavior] = deque(((r[0], r[1], int(r[2])) for r in rows), maxlen=self.size)
 

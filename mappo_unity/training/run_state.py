@@ -143,7 +143,7 @@ class RunState:
             self.setup.fleet.set_parameter(change.name, change.lesson.value)
         if any(change.require_reset for change in changes):
             self._reset_scenes(batches)
-        self.recent_episodes.forget()
+        self.recent_episodes.begin_anew()
         self.best_score = -math.inf
         self.matches.forget()
         return [f"{self.agent_steps:,} steps: {change}" for change in changes]
