@@ -2,9 +2,10 @@
 """Train the scenes of cooperation with each kind of critic, and draw their returns in one picture a scene.
 
 MAPPO's central critic, independent learners' local one (IPPO), MA-POCA's and attention; all else is the
-preset of the scene. With fewer --steps than the preset's the entropy falls as in the preset's beginning. Runs
-lie in OUT/SCENE-CRITIC-SEED and are resumed after any interruption; what was trained is appended to
-docs/benchmarks/critics.csv and is not run again. Table and picture stand on the scene's page.
+preset of the scene. With fewer --steps than the preset's its entropy bonus and learning rate fall as in its
+beginning. Of a preset with lessons, curves are of the last one. Runs lie in OUT/SCENE-CRITIC-SEED and are
+resumed after any interruption; what was trained is appended to docs/benchmarks/critics.csv and is not run
+again. Table and picture stand on the scene's page.
 
     python scripts/compare_critics.py DungeonEscape [--critics central local] [--seeds 0 1 2] [--steps N]
     python scripts/compare_critics.py --draw                  # only the tables and the pictures
@@ -15,12 +16,14 @@ The pictures need matplotlib.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import statistics
 import time
 from itertools import product
 from pathlib import Path
 
+from decisions_to import read_last_lesson, with_value
 from learn_scene import append, read_rows, thin
 from score_page import BENCHMARKS, ROOT, Point, draw_seeds, put_between
 from score_table import train
@@ -40,6 +43,7 @@ CURVES = BENCHMARKS / "critics.csv"
 PAGES = ROOT / "docs/scenes"
 BEGIN, END = "<!-- critics -->\n", "<!-- end of critics -->\n"
 POINTS = 60  # of a curve
+NOT_THERE = "still in a lesson"  # in place of a return: of seeds that did not come to the last one
 
 Curves = dict[str, dict[str, list[Point]]]
 """Curves by critic and seed."""
@@ -79,7 +83,9 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
     folder, load = arguments.out / "-".join(key), os.getloadavg()[0]
     train(scene, seed, folder, arguments.minutes, options(scene, critic, arguments.steps or SCENES[scene]))
 
-    rows = [row for row in read_metrics(folder / "metrics.csv") if row["episodes"] >= 100]
+    rows = with_value(read_last_lesson(folder), "return_mean")
+    if not rows:  # it stayed in an earlier lesson
+        rows = [read_metrics(folder / "metrics.csv")[-1] | {"group_return_mean": math.nan}]
     for row in thin(rows, POINTS):
         point = {
             "date": time.strftime("%Y-%m-%d"),
@@ -96,12 +102,13 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
 
 
 def options(scene: str, critic: str, steps: int) -> list[str]:
-    """Return the options of a run that is the beginning of the preset's: its entropy falls as there."""
+    """Return the options of a run that is the beginning of the preset's: what falls there falls as there."""
     preset = compose_config([f"env={scene}"]).config
-    fallen = steps / preset.max_steps
-    start, end = preset.ppo.entropy_coef, preset.ppo.entropy_coef_final
-    entropy = f"ppo.entropy_coef_final={start + fallen * (end - start):.6g}"
-    return [f"model.critic={critic}", f"max_steps={steps}", entropy, "update_threads=1"]
+    ppo, fallen = preset.ppo, steps / preset.max_steps
+    lr = ppo.lr + fallen * (ppo.lr_final - ppo.lr)
+    entropy = ppo.entropy_coef + fallen * (ppo.entropy_coef_final - ppo.entropy_coef)
+    finals = [f"ppo.lr_final={lr:.6g}", f"ppo.entropy_coef_final={entropy:.6g}"]
+    return [f"model.critic={critic}", f"max_steps={steps}", *finals, "update_threads=1"]
 
 
 def read_curves() -> dict[str, Curves]:
@@ -121,7 +128,10 @@ def write_page(scene: str, curves: Curves) -> None:
     for critic, own in curves.items():
         ends = [points[-1] for _, points in sorted(own.items())]
         earned = [at_the_end(points) for _, points in sorted(own.items())]
-        values = f"**{statistics.mean(earned):.2f}** ({', '.join(f'{value:.2f}' for value in earned)})"
+        came = [value for value in earned if not math.isnan(value)]
+        mean = f"**{statistics.mean(came):.2f}**" if came else NOT_THERE
+        each = ", ".join(NOT_THERE if math.isnan(value) else f"{value:.2f}" for value in earned)
+        values = f"{mean} ({each})"
         decisions = ", ".join(f"{steps / 1e6:.1f} M" for steps in sorted({steps for steps, *_ in ends}))
         pace = statistics.mean(1e6 * minutes / steps for steps, minutes, _ in ends)
         cells = CRITICS[critic][0], ", ".join(sorted(own)), decisions, values, f"{pace:.1f}"

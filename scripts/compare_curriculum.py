@@ -18,7 +18,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from decisions_to import Metrics, columns_of, reached_cells, with_value
+from decisions_to import Metrics, columns_of, in_last_lesson, reached_cells, with_value
 from learn_scene import append, mappo_eval, read_rows
 from score_measures import behavior_return
 from score_page import BENCHMARKS, ROOT, put_between
@@ -111,14 +111,9 @@ def first_at_both(metrics: Metrics, goal: float) -> dict[str, int | float] | Non
 
     A return counts from the 100th episode on, as in decisions_to.
     """
-    rows = with_value(metrics, "return_mean")
-    return next((row for row in rows if has_full_height(row) and stands_at(row, goal)), None)
-
-
-def has_full_height(row: dict[str, int | float]) -> bool:
-    """Return whether every lesson of a row is the last one; without a curriculum there are none."""
-    lessons = [value for name, value in row.items() if name.startswith("lesson/")]
-    return all(lesson == LAST_LESSON for lesson in lessons)
+    lessons = [name for name in metrics[0] if name.startswith("lesson/")]  # none without a curriculum
+    full_height = in_last_lesson(metrics, dict.fromkeys(lessons, LAST_LESSON))
+    return next((row for row in with_value(full_height, "return_mean") if stands_at(row, goal)), None)
 
 
 def stands_at(row: dict[str, int | float], goal: float) -> bool:

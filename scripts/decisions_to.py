@@ -4,7 +4,8 @@
 Runs are named by their folders, or by folders that hold some. Printed is a table in Markdown: each run's
 decisions and minutes (of collecting and learning) until the metric, return_mean of the last 100 episodes
 unless another column of metrics.csv is named, was VALUE for the first time (a dash: never), its best and its
-last value, and the run's decisions. A return counts from the 100th episode on: the first few are luck.
+last value, and the run's decisions. A return counts from the 100th episode on: the first few are luck; of a
+run with a curriculum, from the 200th of the last lesson on.
 
     python scripts/decisions_to.py VALUE RUN ... [--metric COLUMN]
 """
@@ -13,8 +14,11 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
+from mappo_unity.config.compose import load_config
+from mappo_unity.config.parameters.values import curricula
 from mappo_unity.runs.metrics_csv import read_metrics
 
 EPISODES = 100  # of a mean return
@@ -55,6 +59,24 @@ def with_value(metrics: Metrics, metric: str) -> Metrics:
     ]
 
 
+def read_last_lesson(run: Path) -> Metrics:
+    """Return the rows of a run's metrics.csv that are of its last lessons; without a curriculum all."""
+    parameters = load_config(run / "config.yaml").env.parameters
+    last = {f"lesson/{name}": len(found.lessons) - 1 for name, found in curricula(parameters).items()}
+    return in_last_lesson(read_metrics(run / "metrics.csv"), last)
+
+
+def in_last_lesson(metrics: Metrics, last: Mapping[str, int]) -> Metrics:
+    """Return the rows whose mean returns are of the last lessons alone, `last` by column.
+
+    The first episodes to end there began before, or are short by luck (see RecentEpisodes.begin_anew).
+    """
+    rows = [row for row in metrics if all(row[name] == number for name, number in last.items())]
+    if not last or not rows:
+        return rows
+    return [row for row in rows if row["episodes"] - rows[0]["episodes"] >= 2 * EPISODES]
+
+
 def columns_of(metrics: Metrics, reached: dict[str, int | float] | None) -> dict[str, object]:
     """Return what a CSV file says of a run: decisions and minutes until a row was reached, and in all."""
     return {
@@ -74,12 +96,13 @@ def reached_cells(row: dict[str, str]) -> tuple[str, str]:
 
 def row(run: Path, goal: float, metric: str) -> str:
     """Return a run's row of the table."""
-    metrics = read_metrics(run / "metrics.csv")
+    metrics = read_last_lesson(run)
     reached = first_at(metrics, goal, metric)
     first = f"{reached['agent_steps']:,.0f} | {reached['wall_s'] / 60:.1f}" if reached else "- | -"
     known = [line[metric] for line in with_value(metrics, metric)]
     best, last = (f"{max(known):.2f}", f"{known[-1]:.2f}") if known else ("-", "-")
-    return f"| {run.parent.name}/{run.name} | {first} | {best} | {last} | {metrics[-1]['agent_steps']:,.0f} |"
+    decisions = read_metrics(run / "metrics.csv")[-1]["agent_steps"]
+    return f"| {run.parent.name}/{run.name} | {first} | {best} | {last} | {decisions:,.0f} |"
 
 
 if __name__ == "__main__":

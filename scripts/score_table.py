@@ -23,6 +23,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from decisions_to import read_last_lesson
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
 from score_measures import MEASURES, Measure, measures_of
 from score_page import CURVES, SCORES, write_page
@@ -104,7 +105,7 @@ def measure_seed(arguments: argparse.Namespace, scene: str, seed: int, options: 
         "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
     }
     for measure in {measure.column: measure for measure in measures_of(scene)}.values():
-        append_curve(measure, seed, metrics)
+        append_curve(measure, seed, read_last_lesson(folder))
     score(arguments, scene, str(seed), [f"run={folder}"], facts)
 
 
@@ -193,7 +194,10 @@ def is_measured(scene: str, player: str) -> bool:
 
 
 def append_curve(measure: Measure, seed: int, metrics: list[dict[str, int | float]]) -> None:
-    """Append a run's curve, thinned out, in decisions and minutes, once 100 episodes have ended."""
+    """Append a run's curve, thinned out, in decisions and minutes, once 100 episodes have ended.
+
+    Of a run with a curriculum it is what it does in its last lesson.
+    """
     known = [
         row for row in metrics if row["episodes"] >= 100 and not math.isnan(row.get(measure.column, math.nan))
     ]

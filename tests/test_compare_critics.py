@@ -40,6 +40,7 @@ def test_every_critic_is_trained_by_the_presets_schedule(scene: str, critic: str
 
     middle = (preset.ppo.entropy_coef + preset.ppo.entropy_coef_final) / 2
     assert config.ppo.entropy_coef_final == pytest.approx(middle)
+    assert config.ppo.lr_final == pytest.approx((preset.ppo.lr + preset.ppo.lr_final) / 2)
 
 
 def test_a_row_has_the_seeds_of_a_critic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,6 +56,7 @@ def test_a_row_has_the_seeds_of_a_critic(tmp_path: Path, monkeypatch: pytest.Mon
     end = {**row, "decisions": 1_000_000, "minutes": 3}
     rows = [row, {**end, "decisions": 950_000, "value": 0.2}, {**end, "value": 0.4}]
     rows += [{**end, "seed": 1, "value": 0.5}, {**end, "critic": "central", "minutes": 2, "value": 0.6}]
+    rows += [{**end, "seed": seed, "critic": "poca", "value": "nan"} for seed in (0, 1)]
     for line in rows:
         append(tmp_path / "critics.csv", line)
     page = tmp_path / "DungeonEscape.md"
@@ -68,7 +70,9 @@ def test_a_row_has_the_seeds_of_a_critic(tmp_path: Path, monkeypatch: pytest.Mon
     assert (lines[0], lines[-1]) == ("before", "after") and "old" not in lines
     assert "| central (MAPPO) | 0 | 1.0 M | **0.60** (0.60) | 2.0 |" in lines
     assert "| local (IPPO) | 0, 1 | 1.0 M | **0.40** (0.30, 0.50) | 3.0 |" in lines
-    assert lines.index("| central (MAPPO) | 0 | 1.0 M | **0.60** (0.60) | 2.0 |") == len(lines) - 4
+    never = compare_critics.NOT_THERE
+    assert f"| MA-POCA | 0, 1 | 1.0 M | {never} ({never}, {never}) | 3.0 |" in lines
+    assert lines.index("| central (MAPPO) | 0 | 1.0 M | **0.60** (0.60) | 2.0 |") == len(lines) - 5
 
 
 def test_a_scene_without_a_team_is_refused(

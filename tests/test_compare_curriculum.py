@@ -63,8 +63,9 @@ def test_both_behaviors_must_stand_at_the_benchmark_at_once() -> None:
 def test_low_walls_do_not_count() -> None:
     low = row(0.9, 0.9, small_wall_height=2, big_wall_height=2)
     half = row(0.9, 0.9, small_wall_height=3, big_wall_height=2)
-    full = row(0.9, 0.9, small_wall_height=3, big_wall_height=3)
-    assert first_at_both([low, half, full], BENCHMARK) is full
+    full = [row(0.9, 0.9, n, small_wall_height=3, big_wall_height=3) for n in (300, 499, 500)]
+    assert first_at_both([low, half, *full], BENCHMARK) is full[2], "the first 200 began before, or by luck"
+    assert first_at_both([low, half, *full[:2]], BENCHMARK) is None
 
 
 def test_cells_are_of_a_way_s_own_rows_by_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
