@@ -36,6 +36,9 @@ OFFICIAL = {  # our preset: file of the official trainer's configuration, behavi
 }
 
 
+GRAVITY = 1.5 * 9.81  # m/s^2, of CooperativePushBlock, whose preset has lessons
+
+
 def composed(*lines):
     return compose_config(list(lines)).config
 
@@ -122,6 +125,7 @@ def test_the_official_learner_is_whole_whatever_the_preset_says(scene):
         k: v for k, v in expected.items() if k not in own
     }
     assert config.env.params.get("ball_touch", 0) == 0
+    assert config.env.params.get("gravity", GRAVITY) == GRAVITY
 
 
 @pytest.mark.parametrize("recipe", ["mappo_paper", "benchmarl"])
