@@ -11,8 +11,15 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
+import decisions_to
 import score_page
+import score_table
 from score_measures import MEASURES, Measure, mean_return
+
+from mappo_unity.config.compose import compose_config
+from mappo_unity.runs.folder import write_record
+
+LESSONS = "{lessons: [{value: 2, completion: {measure: progress, threshold: 0.5}}, {value: 14.715}]}"
 
 
 def test_the_table_in_readme_is_that_of_the_measured_scores() -> None:
@@ -72,3 +79,24 @@ def test_a_row_says_how_many_seeds_there_are(curves: None) -> None:
     cells = score_page.summary_row(Measure("Probe", "return", mean_return, 0.5), rows).split(" | ")
     assert cells[1:-1] == ["return", "-1", "**0.6** (of 2)", "-", ">= 0.5"]
     assert cells[-1].startswith("0.00 M decisions, 1.0 min (1 of 2 seeds)")
+
+
+def note_options(folder: Path, *options: str) -> None:
+    """Write the record of a run."""
+    write_record(folder, compose_config(list(options)).config, list(options))
+
+
+def test_a_run_is_evaluated_in_its_last_lesson_wherever_it_stands(tmp_path: Path) -> None:
+    note_options(tmp_path, "env=CooperativePushBlock", f"env.params.gravity={LESSONS}")
+    assert score_table.last_lesson(tmp_path) == ["env.params.gravity=14.715"]
+
+    note_options(tmp_path, "env=Basic")
+    assert score_table.last_lesson(tmp_path) == []
+
+
+def test_a_curve_is_of_the_last_lesson(tmp_path: Path) -> None:
+    note_options(tmp_path, "env=CooperativePushBlock", f"env.params.gravity={LESSONS}")
+    rows = [(100, 0, 9.0), (140, 1, 8.0), (339, 1, 7.0), (340, 1, 6.0), (400, 1, 5.0)]
+    lines = [f"{episodes},{lesson},{value}" for episodes, lesson, value in rows]
+    (tmp_path / "metrics.csv").write_text("\n".join(["episodes,lesson/gravity,return_mean", *lines]) + "\n")
+    assert [row["return_mean"] for row in decisions_to.read_last_lesson(tmp_path)] == [6.0, 5.0]
