@@ -84,6 +84,10 @@ def test_a_group_can_be_measured_by_what_it_earns_together() -> None:
     raw = two(measure="group_reward", threshold=5, signal_smoothing=False, min_lesson_length=2)
     lessons, resumed = (Lessons(parameters(*raw), {"A": 2}) for _ in range(2))
     assert lessons.notes == []
+    assert Lessons(parameters(*raw), {"A": 1}).notes == [
+        "note: env.params.level.lessons[0].completion measures what A earns as a group, but its agents are "
+        "alone"
+    ]
     assert lessons.advance(episodes(100, 100, group=4), 0.0) == []
 
     resumed.load_state_dict(lessons.state_dict())

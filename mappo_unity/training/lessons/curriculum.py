@@ -219,6 +219,8 @@ class Lessons:
                     f"note: {where} measures the individual rewards of {policy}, as ML-Agents does; what its "
                     f"agents earn as a group does not count (measure: {GROUP_REWARD})"
                 )
+            if completion.measure == GROUP_REWARD and team_sizes[policy] == 1:
+                yield f"note: {where} measures what {policy} earns as a group, but its agents are alone"
 
 
 def _listed(windows: Mapping[str, deque[float]]) -> dict[str, list[float]]:
