@@ -31,6 +31,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from mappo_unity import gym_env, make_scene, parallel_env, vector_env
 from mappo_unity.cli import player_main
 from mappo_unity.errors import ConfigError
+from mappo_unity.farama.session import Session
 
 SCENES = ["3DBall", "Basic", "DungeonEscape", "PushBlock", "SoccerTwos", "WallJump"]
 
@@ -260,6 +261,13 @@ def test_an_option_of_areas_counts() -> None:
     env = parallel_env("Basic", "env.num_areas=3")
     assert len(env.possible_agents) == 3
     env.close()
+
+
+def test_a_preset_with_lessons_is_at_its_last() -> None:
+    session = Session("CooperativePushBlock", [], seed=0, num_areas=1)
+    scene: Any = session._env
+    assert scene.parameters["gravity"] == 14.715, "the scene's own"
+    session.close()
 
 
 def test_group_rewards_are_added_when_asked_for() -> None:

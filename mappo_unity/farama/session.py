@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from mlagents_envs.base_env import ActionTuple, BaseEnv, DecisionSteps, TerminalSteps
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.config.parameters.values import params_at
 from mappo_unity.config.schema import Backend
 from mappo_unity.envs.backends import MakeEnv, make_env_function
 from mappo_unity.envs.opening import First, first_results
@@ -36,6 +37,7 @@ class Session:
             is_given = any(line.startswith("env.num_areas=") for line in options)
             if num_areas is not None and not is_given and cfg.backend is not Backend.custom:
                 cfg.num_areas = num_areas
+            cfg.params = params_at(cfg.params, {}, missing=-1)  # whoever trains elsewhere has no lessons
             self.name = cfg.name
             self._make = make_env_function(cfg)
             self._env = self._make(seed)
