@@ -29,7 +29,7 @@ from score_measures import MEASURES, Measure, measures_of
 from score_page import CURVES, SCORES, write_page
 
 from mappo_unity.config.compose import load_config
-from mappo_unity.config.parameters.values import curricula
+from mappo_unity.config.parameters.values import curricula, values_at
 from mappo_unity.runs.metrics_csv import read_metrics
 
 POINTS = 60  # of a curve
@@ -106,19 +106,18 @@ def measure_seed(arguments: argparse.Namespace, scene: str, seed: int, options: 
         "options": " ".join(options),
         "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
     }
+    shown = read_last_lesson(folder)
     for measure in {measure.column: measure for measure in measures_of(scene)}.values():
-        append_curve(measure, seed, read_last_lesson(folder))
+        append_curve(measure, seed, shown)
     score(arguments, scene, str(seed), [f"run={folder}", *last_lesson(folder)], facts)
 
 
 def last_lesson(folder: Path) -> list[str]:
     """Return the options that play a run's last lessons, where they are numbers, wherever it has come to."""
-    options = []
-    for name, curriculum in curricula(load_config(folder / "config.yaml").env.parameters).items():
-        value = curriculum.lessons[-1].value
-        if isinstance(value, float):
-            options.append(f"env.params.{name}={value:g}")
-    return options
+    parameters = load_config(folder / "config.yaml").env.parameters
+    values = values_at(parameters, {}, missing=-1)
+    last = {name: values[name] for name in curricula(parameters)}
+    return [f"env.params.{name}={value:g}" for name, value in last.items() if isinstance(value, float)]
 
 
 def train(scene: str, seed: int, folder: Path, minutes: float, options: list[str]) -> None:
