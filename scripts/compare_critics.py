@@ -83,7 +83,7 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
     folder, load = arguments.out / "-".join(key), os.getloadavg()[0]
     train(scene, seed, folder, arguments.minutes, options(scene, critic, arguments.steps or SCENES[scene]))
 
-    rows = with_value(read_last_lesson(folder), "return_mean")
+    rows = with_value(read_last_lesson(folder), "group_return_mean")
     if not rows:  # it stayed in an earlier lesson
         rows = [read_metrics(folder / "metrics.csv")[-1] | {"group_return_mean": math.nan}]
     for row in thin(rows, POINTS):

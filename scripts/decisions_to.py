@@ -50,8 +50,8 @@ def first_at(metrics: Metrics, goal: float, metric: str = "return_mean") -> dict
 
 
 def with_value(metrics: Metrics, metric: str) -> Metrics:
-    """Return the rows that have a value: of matches few have, and a mean return needs episodes."""
-    needed = EPISODES if metric == "return_mean" else 0
+    """Return the rows that have a value: of matches few have, and a mean return needs its episodes."""
+    needed = EPISODES if metric.endswith("return_mean") else 0
     return [
         line
         for line in metrics
@@ -61,9 +61,13 @@ def with_value(metrics: Metrics, metric: str) -> Metrics:
 
 def read_last_lesson(run: Path) -> Metrics:
     """Return the rows of a run's metrics.csv that are of its last lessons; without a curriculum all."""
+    return in_last_lesson(read_metrics(run / "metrics.csv"), last_lessons(run))
+
+
+def last_lessons(run: Path) -> dict[str, int]:
+    """Return the numbers of a run's last lessons, by column of its metrics.csv."""
     parameters = load_config(run / "config.yaml").env.parameters
-    last = {f"lesson/{name}": len(found.lessons) - 1 for name, found in curricula(parameters).items()}
-    return in_last_lesson(read_metrics(run / "metrics.csv"), last)
+    return {f"lesson/{name}": len(found.lessons) - 1 for name, found in curricula(parameters).items()}
 
 
 def in_last_lesson(metrics: Metrics, last: Mapping[str, int]) -> Metrics:
@@ -96,13 +100,13 @@ def reached_cells(row: dict[str, str]) -> tuple[str, str]:
 
 def row(run: Path, goal: float, metric: str) -> str:
     """Return a run's row of the table."""
-    metrics = read_last_lesson(run)
+    every = read_metrics(run / "metrics.csv")
+    metrics = in_last_lesson(every, last_lessons(run))
     reached = first_at(metrics, goal, metric)
     first = f"{reached['agent_steps']:,.0f} | {reached['wall_s'] / 60:.1f}" if reached else "- | -"
     known = [line[metric] for line in with_value(metrics, metric)]
     best, last = (f"{max(known):.2f}", f"{known[-1]:.2f}") if known else ("-", "-")
-    decisions = read_metrics(run / "metrics.csv")[-1]["agent_steps"]
-    return f"| {run.parent.name}/{run.name} | {first} | {best} | {last} | {decisions:,.0f} |"
+    return f"| {run.parent.name}/{run.name} | {first} | {best} | {last} | {every[-1]['agent_steps']:,.0f} |"
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ OPTIONs of mappo-train are noted with the run. The pictures need matplotlib.
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import signal
 import subprocess
@@ -23,7 +22,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from decisions_to import read_last_lesson
+from decisions_to import read_last_lesson, with_value
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
 from score_measures import MEASURES, Measure, measures_of
 from score_page import CURVES, SCORES, write_page
@@ -205,14 +204,11 @@ def is_measured(scene: str, player: str) -> bool:
 
 
 def append_curve(measure: Measure, seed: int, metrics: list[dict[str, int | float]]) -> None:
-    """Append a run's curve, thinned out, in decisions and minutes, once 100 episodes have ended.
+    """Append a run's curve, thinned out, in decisions and minutes, from its first values on.
 
     Of a run with a curriculum it is what it does in its last lesson.
     """
-    known = [
-        row for row in metrics if row["episodes"] >= 100 and not math.isnan(row.get(measure.column, math.nan))
-    ]
-    for row in thin(known, POINTS):
+    for row in thin(with_value(metrics, measure.column), POINTS):
         point = {
             "scene": measure.scene,
             "column": measure.column,
