@@ -8,7 +8,7 @@ What plays is a run folder, a checkpoint, an ONNX file, or chance.
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 from mappo_unity import load_policy, make_scene
 
@@ -44,6 +44,10 @@ def main(scene_name: str, where: str, num_episodes: int = 20) -> float:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
-        sys.exit(__doc__)
-    main(sys.argv[1], sys.argv[2])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scene", help="an embedded scene, such as 3DBall")
+    parser.add_argument("policy", help="what plays")
+    arguments = parser.parse_args()
+    main(arguments.scene, arguments.policy)

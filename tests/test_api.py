@@ -87,3 +87,9 @@ def test_the_example_that_plays(capsys):
     trained, random = (example("play_policy").main("3DBall", where, 12) for where in ("run", "random"))
     assert trained > 0 and random > 0
     assert "3DBall played by run: mean return" in capsys.readouterr().out
+
+
+def test_the_example_that_plays_says_what_it_wants():
+    script = [sys.executable, str(EXAMPLES / "play_policy.py"), "3DBall"]
+    done = subprocess.run(script, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "required: policy" in done.stderr
