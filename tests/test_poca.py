@@ -112,6 +112,21 @@ def test_numbers_are_those_of_a_loop_over_teams_and_members(layout):
             assert torch.allclose(baseline[row, judged], by_hand(critic, entities), atol=1e-5)
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_both_at_once_are_the_two_alone_with_their_gradients(layout):
+    critic, entries = critic_of(layout), team(layout)
+    entries[2][1, 2] = True  # one has departed
+    weights = list(critic.parameters())
+
+    value, baseline = critic.value_and_baseline(*entries)
+    both = torch.autograd.grad((value**2).sum() + (baseline**2).sum(), weights)
+    alone, own = critic.value(*entries[:-1]), critic.baseline(*entries)
+    torch.testing.assert_close((value, baseline), (alone, own))
+
+    for one, other in zip(both, torch.autograd.grad((alone**2).sum() + (own**2).sum(), weights)):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+
+
 def test_a_team_of_one_and_of_nobody_have_finite_values_and_gradients():
     critic = critic_of(team_size=1)
     obs, present, departed, action = team(team_size=1)

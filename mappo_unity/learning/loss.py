@@ -7,6 +7,7 @@ memories need another one, and TorchRL's wrappers cost more than small networks 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -71,7 +72,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         self.set_keys(value=keys.VALUE, sample_log_prob=keys.LOG_PROB, action=keys.ACTION)
         self._actor, self._critic = actor, critic.module
         self._policy: Callable[..., Tensor] = compiled(actor.module[0].module.forward, cfg.compile)
-        self._value: Callable[..., Tensor] = compiled(value_method(critic.module), cfg.compile)
+        self._judge: Callable[..., Any] = compiled(judging_method(critic.module), cfg.compile)
         self.critic_keys = [str(key) for key in critic.in_keys]
         self.log_ratio = self.ratio = self.entropy = torch.zeros(())
 
@@ -172,9 +173,10 @@ class MaskedClipPPOLoss(ClipPPOLoss):
             return critic.unroll(inputs, action, rows.get(MEMBER), rows)
 
         inputs = [rows.get(key) for key in self.critic_keys]
-        value = self._value(*inputs)
-        has_baseline = isinstance(critic, PocaCritic)
-        return value, critic.baseline(*inputs, rows.get(keys.ACTION)) if has_baseline else None
+        if not isinstance(critic, PocaCritic):
+            return self._judge(*inputs), None
+        value, baseline = self._judge(*inputs, rows.get(keys.ACTION))
+        return value, baseline
 
     def _distance(self, value: Tensor, target: Tensor, old: Tensor | None, clip: float) -> Tensor:
         """Return distances ``[..., 1]`` of values ``[..., V]``: the mean over reward streams (ML-Agents)."""
@@ -189,9 +191,9 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         return (value - target) ** 2
 
 
-def value_method(critic: nn.Module) -> Callable[..., Tensor]:
-    """Return what gives a critic's values for rows: a POCA critic has two outputs."""
-    return critic.value if isinstance(critic, PocaCritic) else critic.forward
+def judging_method(critic: nn.Module) -> Callable[..., Any]:
+    """Return what gives a critic's values for rows, and a POCA critic's baselines beside them."""
+    return critic.value_and_baseline if isinstance(critic, PocaCritic) else critic.forward
 
 
 def _where(mask: Tensor | None, log_ratio: Tensor) -> Tensor:

@@ -55,15 +55,12 @@ class ValueReader:
             return self._read_in_turn(self.critic, rounds, following)
 
         inputs = self._inputs(rounds)
-        value = self._value(inputs)
+        value, baseline = self._value_and_baseline(inputs, rounds)
         end = torch.zeros_like(value)
         at, cut_off = following.get(keys.CUT_OFF_AT), following.get(keys.CUT_OFF)
         if len(at):
             end.flatten(0, -3)[at] = self._value(self._inputs(cut_off))
 
-        baseline = None
-        if isinstance(self.critic, PocaCritic):
-            baseline = self.norm.denormalize(self.critic.baseline(*inputs, rounds.get(keys.ACTION)))
         return Values(value, end, self._value(self._inputs(following.get(keys.FINAL))), baseline)
 
     @torch.no_grad()
@@ -87,6 +84,14 @@ class ValueReader:
 
     def _value(self, inputs: list[Tensor]) -> Tensor:
         return self.norm.denormalize(self.critic(*inputs))
+
+    def _value_and_baseline(
+        self, inputs: list[Tensor], rounds: TensorDictBase
+    ) -> tuple[Tensor, Tensor | None]:
+        if not isinstance(self.critic, PocaCritic):
+            return self._value(inputs), None
+        value, baseline = self.critic.value_and_baseline(*inputs, rounds.get(keys.ACTION))
+        return self.norm.denormalize(value), self.norm.denormalize(baseline)
 
     def _read_in_turn(self, critic: RecurrentCritic, rounds: TensorDict, following: TensorDictBase) -> Values:
         inputs = self._inputs(rounds)

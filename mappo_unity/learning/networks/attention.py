@@ -6,7 +6,7 @@ variance 0.125 / width (T-Fixup), four heads, layer norms without weights.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -32,8 +32,20 @@ class ResidualSelfAttention(nn.Module):
 
     def forward(self, entities: Tensor, seen: Tensor) -> Tensor:
         """Return the mean over the entities that are there; ``seen`` ``[..., N]`` is 1 for them, else 0."""
+        return self.attend(self.read(entities), seen)
+
+    def read(self, entities: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the normalised entities, and of each its query, its key and its content, ``[..., N, h]``.
+
+        Whoever puts them together anew for `attend` need not compute them anew.
+        """
         x = layer_norm(entities, (self.width,))
-        query, key, content = (self._heads(net(x)) for net in (self.query, self.key, self.content))
+        return x, self.query(x), self.key(x), self.content(x)
+
+    def attend(self, read: Iterable[Tensor], seen: Tensor) -> Tensor:
+        """Return what `forward` returns, from what `read` returned."""
+        x, *projected = read
+        query, key, content = (self._heads(part) for part in projected)
 
         scores = query @ key.transpose(-1, -2) / self.width**0.5  # [..., heads, N, N]
         absent = (seen == 0).unsqueeze(-2).unsqueeze(-2)

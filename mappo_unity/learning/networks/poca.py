@@ -13,6 +13,8 @@ So the baseline of a member does not depend on its own action, and a team may ch
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
@@ -28,6 +30,9 @@ from mappo_unity.learning.networks.critics import seen_features
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
 from mappo_unity.learning.networks.mlp import ACTIVATIONS
+
+Read = tuple[Tensor, ...]
+"""What `ResidualSelfAttention.read` returns of a team's members."""
 
 
 class PocaCritic(nn.Module):
@@ -101,34 +106,56 @@ class PocaCritic(nn.Module):
         """
         return self.head(self.baseline_features(*inputs))
 
+    def value_and_baseline(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `value` and `baseline` of the same entries; what both read is computed once.
+
+        Args:
+            *inputs: as in `baseline`.
+        """
+        *entries, action = inputs
+        features, seen = seen_features(self.encoder, tuple(entries))
+        observed, acted = self._observed(features), self._acted(features, seen, action)
+        return self.head(self._of_team(observed, seen)), self.head(self._of_mates(observed, acted, seen))
+
     def features(self, *inputs: Tensor) -> Tensor:
         """Return what `head` makes the value of: ``[..., A, size + 1]``, the last column the count.
 
         ML-Agents puts its memory over all columns but the last.
         """
         features, seen = seen_features(self.encoder, inputs)
-        out = self._pool(self.observed(features), seen.squeeze(-1))
-        return out.unsqueeze(-2).expand(*features.shape[:-1], self.size + 1)
+        return self._of_team(self._observed(features), seen)
 
     def baseline_features(self, *inputs: Tensor) -> Tensor:
         """Return what `head` makes the baselines of: ``[..., A, size + 1]``, as in `features`."""
         *entries, action = inputs
         features, seen = seen_features(self.encoder, tuple(entries))
+        return self._of_mates(self._observed(features), self._acted(features, seen, action), seen)
+
+    def _observed(self, features: Tensor) -> Read:
+        """Return what attention reads of members by their observations alone."""
+        return self.attention.read(self.observed(features))
+
+    def _acted(self, features: Tensor, seen: Tensor, action: Tensor) -> Read:
+        """Return what attention reads of members by observation and action."""
         actions = flat_actions(action, self.layout) * seen
+        return self.attention.read(self.acted(torch.cat([features, actions], -1)))
 
-        observed = self.observed(features).unsqueeze(-3)  # [..., 1, A, h]
-        acted = self.acted(torch.cat([features, actions], -1)).unsqueeze(-3)
+    def _of_team(self, observed: Read, seen: Tensor) -> Tensor:
+        """Return the value's features, the same for each member."""
+        out = self._pool(observed, seen.squeeze(-1))
+        return out.unsqueeze(-2).expand(*seen.shape[:-1], self.size + 1)
 
-        # [A, A, 1]: of the team that judges row a, only entity a shows no action
-        own = torch.eye(features.shape[-2], dtype=torch.bool, device=features.device).unsqueeze(-1)
-        entities = torch.where(own, observed, acted)  # [..., A, A, h]
-
-        there = seen.squeeze(-1).unsqueeze(-2).expand(entities.shape[:-1])
+    def _of_mates(self, observed: Read, acted: Read, seen: Tensor) -> Tensor:
+        """Return the baselines' features: of the entities that judge a member its own shows no action."""
+        # [A, A, 1]: of the team that judges row a, entity a
+        own = torch.eye(seen.shape[-2], dtype=torch.bool, device=seen.device).unsqueeze(-1)
+        entities = [torch.where(own, a.unsqueeze(-3), b.unsqueeze(-3)) for a, b in zip(observed, acted)]
+        there = seen.squeeze(-1).unsqueeze(-2).expand(entities[0].shape[:-1])
         return self._pool(entities, there)
 
-    def _pool(self, entities: Tensor, seen: Tensor) -> Tensor:
-        """Turn entities ``[..., A, h]`` with flags ``[..., A]`` into features ``[..., size + 1]``."""
-        hidden = self.trunk(self.attention(entities, seen))
+    def _pool(self, entities: Iterable[Tensor], seen: Tensor) -> Tensor:
+        """Turn what was read of entities, with flags ``[..., A]``, into features ``[..., size + 1]``."""
+        hidden = self.trunk(self.attention.attend(entities, seen))
         # -1 for nobody, 1 for a full team
         count = 2.0 * seen.sum(-1, keepdim=True) / self.team_size - 1.0
         return torch.cat([hidden, count], -1)
