@@ -31,7 +31,7 @@ from score_table import train
 from mappo_unity.config.compose import compose_config
 from mappo_unity.runs.metrics_csv import read_metrics
 
-SCENES = {"CooperativePushBlock": 3_000_000, "DungeonEscape": 2_000_000}
+SCENES = {"CooperativePushBlock": 2_500_000, "DungeonEscape": 2_000_000}
 """Agent decisions of a run."""
 CRITICS = {
     "central": ("central (MAPPO)", "tab:blue"),
