@@ -99,8 +99,7 @@ class ValueReader:
         first, valued = rounds.get(keys.FIRST), rounds.get(VALUED)
 
         outputs, states, after = {}, {}, {}
-        for name in critic.state_names:
-            features = critic.features(name, inputs, action)
+        for name, features in critic.features(inputs, action).items():
             outputs[name], states[name], after[name] = self._walk(critic, name, features, first, valued)
 
         value = self.norm.denormalize(critic.values(outputs[VALUE_STATE]))
@@ -108,11 +107,11 @@ class ValueReader:
         at, cut_off = following.get(keys.CUT_OFF_AT), following.get(keys.CUT_OFF)
         if len(at):
             # a terminal observation follows the slot's last decision
-            features = critic.features(VALUE_STATE, self._inputs(cut_off), None)
+            features = critic.features(self._inputs(cut_off))[VALUE_STATE]
             out, _ = critic.step(features, after[VALUE_STATE].flatten(0, -3)[at])
             end.flatten(0, -3)[at] = self.norm.denormalize(critic.values(out))
 
-        features = critic.features(VALUE_STATE, self._inputs(following.get(keys.FINAL)), None)
+        features = critic.features(self._inputs(following.get(keys.FINAL)))[VALUE_STATE]
         final = self.norm.denormalize(critic.values(critic.step(features, after[VALUE_STATE][-1])[0]))
 
         baseline = outputs.get(BASELINE_STATE)

@@ -112,10 +112,8 @@ class PocaCritic(nn.Module):
         Args:
             *inputs: as in `baseline`.
         """
-        *entries, action = inputs
-        features, seen = seen_features(self.encoder, tuple(entries))
-        observed, acted = self._observed(features), self._acted(features, seen, action)
-        return self.head(self._of_team(observed, seen)), self.head(self._of_mates(observed, acted, seen))
+        value, baseline = self.both_features(*inputs)
+        return self.head(value), self.head(baseline)
 
     def features(self, *inputs: Tensor) -> Tensor:
         """Return what `head` makes the value of: ``[..., A, size + 1]``, the last column the count.
@@ -130,6 +128,13 @@ class PocaCritic(nn.Module):
         *entries, action = inputs
         features, seen = seen_features(self.encoder, tuple(entries))
         return self._of_mates(self._observed(features), self._acted(features, seen, action), seen)
+
+    def both_features(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `features` and `baseline_features`; what both read is computed once."""
+        *entries, action = inputs
+        features, seen = seen_features(self.encoder, tuple(entries))
+        observed, acted = self._observed(features), self._acted(features, seen, action)
+        return self._of_team(observed, seen), self._of_mates(observed, acted, seen)
 
     def _observed(self, features: Tensor) -> Read:
         """Return what attention reads of members by their observations alone."""

@@ -149,14 +149,17 @@ class RecurrentCritic(nn.Module):
         """Entries of the states that it needs."""
         return [VALUE_STATE, BASELINE_STATE] if self.has_baseline else [VALUE_STATE]
 
-    def features(self, name: str, inputs: list[Tensor], action: Tensor | None) -> Tensor:
-        """Return what the memory of this state takes (and beside it the count, for POCA): ``[..., A, F]``."""
+    def features(self, inputs: list[Tensor], action: Tensor | None = None) -> dict[str, Tensor]:
+        """Return what the memory of each state takes (and beside it the count, for POCA): ``[..., A, F]``.
+
+        Without the mates' actions there is no baseline.
+        """
         if not isinstance(self.critic, PocaCritic):
-            return self.critic(*inputs)
-        if name == VALUE_STATE:
-            return self.critic.features(*inputs)
-        assert action is not None, "a baseline reads the mates' actions"
-        return self.critic.baseline_features(*inputs, action)
+            return {VALUE_STATE: self.critic(*inputs)}
+        if action is None:
+            return {VALUE_STATE: self.critic.features(*inputs)}
+        value, baseline = self.critic.both_features(*inputs, action)
+        return {VALUE_STATE: value, BASELINE_STATE: baseline}
 
     def step(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return what `values` takes of one decision ``[..., H]``, and the states ``[..., M]`` after it."""
@@ -179,8 +182,7 @@ class RecurrentCritic(nn.Module):
             states: holds the states ``[B, M]`` at the sequences' beginnings, see `state_names`.
         """
         out = []
-        for name in self.state_names:
-            features = self.features(name, inputs, action)
+        for name, features in self.features(inputs, action).items():
             if self.sees_team:
                 features = features[torch.arange(len(member), device=member.device), :, member]
             hidden = self.memory.unroll(features[..., : self.memory.layer.input_size], states.get(name))
