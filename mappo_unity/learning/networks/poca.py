@@ -104,7 +104,7 @@ class PocaCritic(nn.Module):
         Args:
             *inputs: as in `value`, then actions ``[..., A, C + K]`` as `ActionDistribution` draws them.
         """
-        return self.head(self.baseline_features(*inputs))
+        return self.value_and_baseline(*inputs)[1]
 
     def value_and_baseline(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return `value` and `baseline` of the same entries; what both read is computed once.
@@ -123,14 +123,8 @@ class PocaCritic(nn.Module):
         features, seen = seen_features(self.encoder, inputs)
         return self._of_team(self._observed(features), seen)
 
-    def baseline_features(self, *inputs: Tensor) -> Tensor:
-        """Return what `head` makes the baselines of: ``[..., A, size + 1]``, as in `features`."""
-        *entries, action = inputs
-        features, seen = seen_features(self.encoder, tuple(entries))
-        return self._of_mates(self._observed(features), self._acted(features, seen, action), seen)
-
     def both_features(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `features` and `baseline_features`; what both read is computed once."""
+        """Return what `head` makes value and baselines of, each as `features` says."""
         *entries, action = inputs
         features, seen = seen_features(self.encoder, tuple(entries))
         observed, acted = self._observed(features), self._acted(features, seen, action)
