@@ -3,9 +3,9 @@
 
 MAPPO's central critic, independent learners' local one (IPPO), MA-POCA's and attention; all else is the
 preset of the scene. With fewer --steps than the preset's its entropy bonus and learning rate fall as in its
-beginning. Of a preset with lessons, curves are of the last one. Runs lie in OUT/SCENE-CRITIC-SEED and are
-resumed after any interruption; what was trained is appended to docs/benchmarks/critics.csv and is not run
-again. Table and picture stand on the scene's page.
+beginning. Of a preset with lessons the table's returns are of the last one, and the picture shows how far a
+seed has come, too. Runs lie in OUT/SCENE-CRITIC-SEED and are resumed after any interruption; what was trained
+is appended to docs/benchmarks/critics.csv and is not run again. Table and picture stand on the scene's page.
 
     python scripts/compare_critics.py DungeonEscape [--critics central local] [--seeds 0 1 2] [--steps N]
     python scripts/compare_critics.py --draw                  # only the tables and the pictures
@@ -22,10 +22,11 @@ import statistics
 import time
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
-from decisions_to import read_last_lesson, with_value
+from decisions_to import EPISODES, Metrics, last_lessons, with_value
 from learn_scene import append, read_rows, thin
-from score_page import BENCHMARKS, ROOT, Point, draw_seeds, put_between
+from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
 
 from mappo_unity.config.compose import compose_config
@@ -43,7 +44,21 @@ CURVES = BENCHMARKS / "critics.csv"
 PAGES = ROOT / "docs/scenes"
 BEGIN, END = "<!-- critics -->\n", "<!-- end of critics -->\n"
 POINTS = 60  # of a curve
-NOT_THERE = "still in a lesson"  # in place of a return: of seeds that did not come to the last one
+NOT_THERE = "-"  # in place of a return: of seeds that did not come to the last lesson
+
+
+class Point(NamedTuple):
+    """A point of a curve."""
+
+    decisions: float
+    minutes: float
+    value: float
+    """Group return of the last 100 episodes, in the lesson of then."""
+    lesson: int
+    """From 1 on."""
+    lessons: int
+    """How many there are; 1: the scene is learnt as it is."""
+
 
 Curves = dict[str, dict[str, list[Point]]]
 """Curves by critic and seed."""
@@ -81,12 +96,13 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
     if any((row["scene"], row["critic"], row["seed"]) == key for row in read_rows(CURVES)):
         return
     folder, load = arguments.out / "-".join(key), os.getloadavg()[0]
-    train(scene, seed, folder, arguments.minutes, options(scene, critic, arguments.steps or SCENES[scene]))
+    steps = arguments.steps or SCENES[scene]
+    train(scene, seed, folder, arguments.minutes, options(scene, critic, steps))
 
-    rows = with_value(read_last_lesson(folder), "group_return_mean")
-    if not rows:  # it stayed in an earlier lesson
-        rows = [read_metrics(folder / "metrics.csv")[-1] | {"group_return_mean": math.nan}]
-    for row in thin(rows, POINTS):
+    # Of a run that was resumed for more steps only the beginning counts.
+    metrics, last = read_metrics(folder / "metrics.csv"), last_lessons(folder)
+    end = next((place for place, row in enumerate(metrics) if row["agent_steps"] >= steps), len(metrics))
+    for row in thin(settled(metrics[: end + 1], list(last)), POINTS):
         point = {
             "date": time.strftime("%Y-%m-%d"),
             "scene": scene,
@@ -95,10 +111,28 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
             "decisions": int(row["agent_steps"]),
             "minutes": f"{row['wall_s'] / 60:.2f}",
             "value": f"{row['group_return_mean']:.4g}",
+            "lesson": 1 + sum(int(row[name]) for name in last),
+            "lessons": 1 + sum(last.values()),
             "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
         }
         append(CURVES, point)
-    print(scene, critic, seed, rows[-1]["group_return_mean"], flush=True)
+    print(" ".join(f"{name}={value}" for name, value in point.items()), flush=True)
+
+
+def settled(metrics: Metrics, lessons: list[str]) -> Metrics:
+    """Return the rows with a group return, but for the first 200 episodes of each later lesson.
+
+    Those began before it, or are short by luck (see `decisions_to.in_last_lesson`).
+    """
+    rows: Metrics = []
+    begun = [0] * len(lessons)
+    first = -math.inf  # episodes when the lesson began
+    for row in metrics:
+        if (now := [int(row[name]) for name in lessons]) != begun:
+            begun, first = now, row["episodes"]
+        if row["episodes"] - first >= 2 * EPISODES:
+            rows.append(row)
+    return with_value(rows, "group_return_mean")
 
 
 def options(scene: str, critic: str, steps: int) -> list[str]:
@@ -115,7 +149,8 @@ def read_curves() -> dict[str, Curves]:
     """Return what has been trained, by scene."""
     scenes: dict[str, Curves] = {}
     for row in sorted(read_rows(CURVES), key=lambda row: list(CRITICS).index(row["critic"])):
-        point = float(row["decisions"]), float(row["minutes"]), float(row["value"])
+        reached = float(row["decisions"]), float(row["minutes"]), float(row["value"])
+        point = Point(*reached, int(row["lesson"]), int(row["lessons"]))
         curves = scenes.setdefault(row["scene"], {})
         curves.setdefault(row["critic"], {}).setdefault(row["seed"], []).append(point)
     return scenes
@@ -123,18 +158,22 @@ def read_curves() -> dict[str, Curves]:
 
 def write_page(scene: str, curves: Curves) -> None:
     """Put the table onto the scene's page."""
-    names = "critic", "seeds", "decisions", "group return, last tenth", "minutes of a million"
+    names = ["critic", "seeds", "decisions", "group return, last tenth", "minutes of a million"]
+    if lessons_of(curves) > 1:
+        names.insert(4, "lesson at the end")
     lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+
     for critic, own in curves.items():
         ends = [points[-1] for _, points in sorted(own.items())]
         earned = [at_the_end(points) for _, points in sorted(own.items())]
         came = [value for value in earned if not math.isnan(value)]
         mean = f"**{statistics.mean(came):.2f}**" if came else NOT_THERE
         each = ", ".join(NOT_THERE if math.isnan(value) else f"{value:.2f}" for value in earned)
-        values = f"{mean} ({each})"
-        decisions = ", ".join(f"{steps / 1e6:.1f} M" for steps in sorted({steps for steps, *_ in ends}))
-        pace = statistics.mean(1e6 * minutes / steps for steps, minutes, _ in ends)
-        cells = CRITICS[critic][0], ", ".join(sorted(own)), decisions, values, f"{pace:.1f}"
+        decisions = ", ".join(f"{steps / 1e6:.1f} M" for steps in sorted({end.decisions for end in ends}))
+        pace = statistics.mean(1e6 * end.minutes / end.decisions for end in ends)
+        cells = [CRITICS[critic][0], ", ".join(sorted(own)), decisions, f"{mean} ({each})", f"{pace:.1f}"]
+        if lessons_of(curves) > 1:
+            cells.insert(4, f"{', '.join(str(end.lesson) for end in ends)} of {lessons_of(curves)}")
         lines.append(f"| {' | '.join(cells)} |")
 
     page = PAGES / f"{scene}.md"
@@ -142,14 +181,26 @@ def write_page(scene: str, curves: Curves) -> None:
     print("\n".join(lines))
 
 
+def lessons_of(curves: Curves) -> int:
+    """Return how many lessons the preset has."""
+    return max(points[-1].lessons for own in curves.values() for points in own.values())
+
+
 def at_the_end(points: list[Point]) -> float:
-    """Return the mean of a curve's last tenth: one window of 100 episodes alone is luck."""
-    begin = 0.9 * points[-1][0]
-    return statistics.mean(value for decisions, _, value in points if decisions >= begin)
+    """Return the mean of a curve's last tenth, nan if that is not in the last lesson.
+
+    One window of 100 episodes alone is luck.
+    """
+    begin = 0.9 * points[-1].decisions
+    last = [point.value for point in points if point.decisions >= begin and point.lesson == point.lessons]
+    return statistics.mean(last) if last else math.nan
 
 
 def draw(scene: str, curves: Curves) -> None:
-    """Draw the group returns against decisions and against minutes, a colour for each critic."""
+    """Draw the group returns against decisions and against minutes, a colour for each critic.
+
+    Below them stand the lessons, where there are any; what was earned in earlier ones is pale.
+    """
     try:
         import matplotlib
     except ImportError:
@@ -158,17 +209,33 @@ def draw(scene: str, curves: Curves) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, 2, figsize=(10, 4), layout="constrained", sharey=True)
-    for axis, place, label in ((axes[0], 0, "million decisions"), (axes[1], 1, "minutes")):
-        scale = 1e6 if place == 0 else 1.0
-        for critic, own in curves.items():
+    heights = [3, 1] if lessons_of(curves) > 1 else [3]
+    shape = {"figsize": (10, 1 + 1.1 * sum(heights)), "height_ratios": heights, "layout": "constrained"}
+    figure, axes = pyplot.subplots(len(heights), 2, sharex="col", sharey="row", squeeze=False, **shape)
+
+    for column, place, scale in ((axes[:, 0], 0, 1e6), (axes[:, 1], 1, 1.0)):
+        for number, (critic, own) in enumerate(curves.items()):
             name, color = CRITICS[critic]
-            seeds = [[(point[place] / scale, point[2]) for point in points] for points in own.values()]
-            draw_seeds(axis, seeds, color, name)
-        axis.set(xlabel=label)
-        axis.grid(alpha=0.3)
-    axes[0].set(ylabel="group return, last 100 episodes", title=scene)
-    axes[1].legend(fontsize="small")
+            column[0].plot([], [], color=color, label=name)
+            for points in own.values():
+                at, values = [point[place] / scale for point in points], [point.value for point in points]
+                final = [point.value if point.lesson == point.lessons else math.nan for point in points]
+                column[0].plot(at, values, color=color, linewidth=0.8, alpha=0.3)
+                column[0].plot(at, final, color=color, linewidth=1.5)
+
+                # Beside each other, where critics are in the same lesson.
+                lessons = [point.lesson + 0.08 * number for point in points]
+                for axis in column[1:]:
+                    axis.step(at, lessons, color=color, where="post")
+        for axis in column:
+            axis.grid(alpha=0.3)
+
+    axes[0, 0].set(ylabel="group return, last 100 episodes", title=scene)
+    axes[-1, 0].set(xlabel="million decisions")
+    axes[-1, 1].set(xlabel="minutes")
+    for axis in axes[1:, 0]:
+        axis.set(ylabel="lesson", yticks=range(1, lessons_of(curves) + 1))
+    axes[0, 1].legend(fontsize="small")
     figure.savefig(BENCHMARKS / f"critics-{scene}.png", dpi=80)
     pyplot.close(figure)
 
