@@ -26,11 +26,12 @@ PLAYER_STRIDE = 100_003
 """Player n of several starts from the seed plus n times this (modulo 2^31)."""
 
 
-def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv:
+def make_env_function(cfg: EnvConfig, log_folder: Path | None = None, is_training: bool = False) -> MakeEnv:
     """Return the function that opens the environment for a seed; parameters are at their first lessons.
 
     Args:
         log_folder: where players write their logs, unless env.player_logs says; None: a temporary folder.
+        is_training: heed env.stagger; episodes that are measured are whole from the first one on.
 
     Raises:
         ConfigError: the options name nothing that can be opened.
@@ -41,7 +42,7 @@ def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv
         )
 
     if cfg.backend is Backend.embedded:
-        return _embedded(cfg)
+        return _embedded(cfg, cfg.stagger and is_training)
     if cfg.backend is Backend.custom:
         return _custom(cfg)
     if cfg.backend is Backend.pettingzoo:
@@ -49,7 +50,7 @@ def make_env_function(cfg: EnvConfig, log_folder: Path | None = None) -> MakeEnv
     return _players(cfg, log_folder)
 
 
-def _embedded(cfg: EnvConfig) -> MakeEnv:
+def _embedded(cfg: EnvConfig, is_staggered: bool) -> MakeEnv:
     from mappo_unity.scenes.registry import BUILT_IN, make_scene
 
     parameters = cfg.parameters
@@ -61,6 +62,7 @@ def _embedded(cfg: EnvConfig) -> MakeEnv:
         scene = make_scene(cfg.name, seed=seed, **params)
         for name, value in later_values(parameters):
             scene.parameters.check(name, value)
+        scene.is_staggered = is_staggered
 
         if cfg.name in BUILT_IN:
             return scene

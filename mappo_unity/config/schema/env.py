@@ -42,6 +42,9 @@ class EnvConfig:
     built Unity player, the Unity Editor, or a player that ML-Agents' registry names (registry)."""
     num_areas: Optional[int] = field(default=None, metadata=_ANY_BUT_CUSTOM)
     """Copies of the playing area inside one environment; null: as many as the Unity scene has."""
+    stagger: bool = field(default=False, metadata={BACKENDS: (Backend.embedded,)})
+    """In training, let each area's first episode begin with a random part of its time limit over: areas that
+    begin together, and end by the limit, would all be at the same time of their episodes in every batch."""
     params: dict[str, Any] = field(default_factory=dict)
     """Environment parameters (env.params.mass=2) of the scene or player, or arguments of env.factory. Also a
     sampler, {sampler: uniform, min: 0.5, max: 10}, or a curriculum, {lessons: [...]}."""

@@ -138,6 +138,10 @@ class CooperativePushBlock(Scene):
         """Apply gravity at once."""
         self.boxes.gravity = self.parameters["gravity"]
 
+    def pass_time(self, share: np.ndarray) -> None:
+        """Set the areas' timers."""
+        self.timer[:] = share * TIME_LIMIT
+
     def scene_state(self) -> dict[str, Any]:
         """Return the bodies and the areas' time."""
         return {"boxes": self.boxes.get_state(), "timer": self.timer.copy()}

@@ -50,6 +50,9 @@ class Scene(BaseEnv):
 
     counter: int
     """Ticks of the academy since the start or the last env.reset()."""
+    is_staggered = False
+    """Whether the first reset lets a part of each area's time limit be over, as `pass_time` does; to be set
+    before it."""
 
     def __init__(
         self, *, num_areas: int | None = None, num_threads: int = 1, seed: int = 0, **parameters: Value
@@ -113,6 +116,14 @@ class Scene(BaseEnv):
     def action_mask(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
         """Return one bool ``[len(slots), branch size]`` a discrete branch, True = forbidden."""
         return [np.zeros((len(slots), size), bool) for size in self.BEHAVIORS[behavior].branches]
+
+    def pass_time(self, share: np.ndarray) -> None:
+        """Set the clocks of areas as if a share [N] of their time limit, 0 to below 1, were over.
+
+        Override it where areas have clocks of their own.
+        """
+        passed = (share * self.MAX_STEP).astype(np.int64)
+        self.agents.step_count[:] = np.repeat(passed, self.agents_per_area)
 
     def parameter_changed(self, name: str) -> None:
         """Apply a parameter that acts at once (gravity); others are read at the next reset."""
@@ -209,7 +220,8 @@ class Scene(BaseEnv):
         ends with zero actions, so the first records after it are one tick old.
         """
         self._check_open()
-        if self.started:
+        is_first = not self.started
+        if not is_first:
             self.counter = 0
             self.agents.step_count[:] = 0
             slots = self.agents.order
@@ -217,6 +229,8 @@ class Scene(BaseEnv):
             self.begin_episode(slots)
             finish_tick(self)
         run_to_exchange(self)
+        if is_first and self.is_staggered:
+            self.pass_time(self.rng.random(self.num_areas))
 
     def step(self) -> None:
         """Run ticks until some agent reports: requests a decision, or has ended."""

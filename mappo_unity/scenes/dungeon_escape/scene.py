@@ -120,6 +120,10 @@ class DungeonEscape(Scene):
         """Apply gravity at once."""
         self.room.gravity = self.parameters["gravity"]
 
+    def pass_time(self, share: np.ndarray) -> None:
+        """Set the areas' timers."""
+        self.timer[:] = share * TIME_LIMIT
+
     def scene_state(self) -> dict[str, Any]:
         """Return the bodies and the areas' rules' state."""
         names = ("has_key", "at_lock", "remaining", "timer")

@@ -148,6 +148,10 @@ class SoccerScene(Scene):
             for again in range(int(conceded.max())):
                 self._score(np.flatnonzero(conceded > again), scorer=np.where(blue > 0, PURPLE, BLUE))
 
+    def pass_time(self, share: np.ndarray) -> None:
+        """Set the areas' timers."""
+        self.timer[:] = share * EPISODE_TICKS
+
     def scene_state(self) -> dict[str, Any]:
         """Return bodies, headings, timers, and the touch rewards in force."""
         return {"physics": self.physics.get_state(), **{name: getattr(self, name).copy() for name in _STATE}}

@@ -182,7 +182,9 @@ def make_unity_env(cfg: Config, players: Path) -> UnityEnv:
         cfg: the options.
         players: the folder where players log.
     """
-    make_env = make_replay_function(cfg) if cfg.bc.only else make_env_function(cfg.env, players)
+    make_env = (
+        make_replay_function(cfg) if cfg.bc.only else make_env_function(cfg.env, players, is_training=True)
+    )
     return UnityEnv(
         make_env,
         cfg.seed,
