@@ -19,7 +19,7 @@ from mappo_unity.scenes.core.exchange import Exchange
 from mappo_unity.scenes.core.parameters import Parameters
 from mappo_unity.scenes.core.records import Records, steps_from_state, steps_state
 from mappo_unity.scenes.core.specs import Behavior, Parameter, at_least_one, checked_seed
-from mappo_unity.scenes.core.tick import finish_tick, run_to_exchange
+from mappo_unity.scenes.core.tick import finish_tick, run_to_exchange, start
 
 
 class Scene(BaseEnv):
@@ -51,8 +51,7 @@ class Scene(BaseEnv):
     counter: int
     """Ticks of the academy since the start or the last env.reset()."""
     is_staggered = False
-    """Whether the first reset lets a part of each area's time limit be over, as `pass_time` does; to be set
-    before it."""
+    """Whether the first reset lets a random part of each area's time limit be over (`pass_time`)."""
 
     def __init__(
         self, *, num_areas: int | None = None, num_threads: int = 1, seed: int = 0, **parameters: Value
@@ -118,12 +117,8 @@ class Scene(BaseEnv):
         return [np.zeros((len(slots), size), bool) for size in self.BEHAVIORS[behavior].branches]
 
     def pass_time(self, share: np.ndarray) -> None:
-        """Set the clocks of areas as if a share [N] of their time limit, 0 to below 1, were over.
-
-        Override it where areas have clocks of their own.
-        """
-        passed = (share * self.MAX_STEP).astype(np.int64)
-        self.agents.step_count[:] = np.repeat(passed, self.agents_per_area)
+        """Let a share [N] of the areas' time limits be over; override it where areas have own clocks."""
+        self.agents.step_count[:] = np.repeat(share * self.MAX_STEP, self.agents_per_area)
 
     def parameter_changed(self, name: str) -> None:
         """Apply a parameter that acts at once (gravity); others are read at the next reset."""
@@ -176,7 +171,6 @@ class Scene(BaseEnv):
         slots = as_slots(slots)
         keep = ~self.agents.enabled[slots]
         slots = slots[keep]
-
         if slots.size:
             self.agents.enable(slots, group_ids[keep] if isinstance(group_ids, np.ndarray) else group_ids)
             self.records.clear_stacks(slots)
@@ -220,17 +214,15 @@ class Scene(BaseEnv):
         ends with zero actions, so the first records after it are one tick old.
         """
         self._check_open()
-        is_first = not self.started
-        if not is_first:
-            self.counter = 0
-            self.agents.step_count[:] = 0
-            slots = self.agents.order
-            self.agents.clear_actions(slots)
-            self.begin_episode(slots)
-            finish_tick(self)
+        if not self.started:
+            return start(self)
+        self.counter = 0
+        self.agents.step_count[:] = 0
+        slots = self.agents.order
+        self.agents.clear_actions(slots)
+        self.begin_episode(slots)
+        finish_tick(self)
         run_to_exchange(self)
-        if is_first and self.is_staggered:
-            self.pass_time(self.rng.random(self.num_areas))
 
     def step(self) -> None:
         """Run ticks until some agent reports: requests a decision, or has ended."""
@@ -297,10 +289,9 @@ class Scene(BaseEnv):
         self.load_scene_state(state["state"])
 
     def _send_terminals(self, slots: np.ndarray, interrupted: bool) -> None:
-        agents = self.agents
-        slots = slots[~agents.done[slots]]
+        slots = slots[~self.agents.done[slots]]
         for behavior in range(len(self.BEHAVIORS)):
-            rows = slots if len(self.BEHAVIORS) == 1 else slots[agents.behavior[slots] == behavior]
+            rows = slots if len(self.BEHAVIORS) == 1 else slots[self.agents.behavior[slots] == behavior]
             if rows.size:
                 self.records.end(behavior, rows, self.observe(behavior, rows), interrupted)
 

@@ -11,6 +11,13 @@ if TYPE_CHECKING:
     from mappo_unity.scenes.core.scene import Scene
 
 
+def start(scene: Scene) -> None:
+    """Run to the first exchange; of a scene that `is_staggered` the areas' times are random then."""
+    run_to_exchange(scene)
+    if scene.is_staggered:
+        scene.pass_time(scene.rng.random(scene.num_areas))
+
+
 def run_to_exchange(scene: Scene) -> None:
     """Run ticks until some agent reports: requests a decision, or has ended."""
     while not begin_tick(scene):
