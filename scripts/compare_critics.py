@@ -24,7 +24,7 @@ from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
-from decisions_to import EPISODES, Metrics, last_lessons, with_value
+from decisions_to import last_lessons, settled, with_value
 from learn_scene import append, read_rows, thin
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
@@ -102,7 +102,8 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
     # Of a run that was resumed for more steps only the beginning counts.
     metrics, last = read_metrics(folder / "metrics.csv"), last_lessons(folder)
     end = next((place for place, row in enumerate(metrics) if row["agent_steps"] >= steps), len(metrics))
-    for row in thin(settled(metrics[: end + 1], list(last)), POINTS):
+    shown = with_value(settled(metrics[: end + 1], last), "group_return_mean")
+    for row in thin(shown, POINTS):
         point = {
             "date": time.strftime("%Y-%m-%d"),
             "scene": scene,
@@ -117,22 +118,6 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
         }
         append(CURVES, point)
     print(" ".join(f"{name}={value}" for name, value in point.items()), flush=True)
-
-
-def settled(metrics: Metrics, lessons: list[str]) -> Metrics:
-    """Return the rows with a group return, but for the first 200 episodes of each later lesson.
-
-    Those began before it, or are short by luck (see `decisions_to.in_last_lesson`).
-    """
-    rows: Metrics = []
-    begun = [0] * len(lessons)
-    first = -math.inf  # episodes when the lesson began
-    for row in metrics:
-        if (now := [int(row[name]) for name in lessons]) != begun:
-            begun, first = now, row["episodes"]
-        if row["episodes"] - first >= 2 * EPISODES:
-            rows.append(row)
-    return with_value(rows, "group_return_mean")
 
 
 def options(scene: str, critic: str, steps: int) -> list[str]:

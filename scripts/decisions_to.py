@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from mappo_unity.config.compose import load_config
@@ -71,14 +71,25 @@ def last_lessons(run: Path) -> dict[str, int]:
 
 
 def in_last_lesson(metrics: Metrics, last: Mapping[str, int]) -> Metrics:
-    """Return the rows whose mean returns are of the last lessons alone, `last` by column.
+    """Return the rows whose mean returns are of the last lessons alone, `last` by column."""
+    rows = settled(metrics, last)
+    return [row for row in rows if all(row[name] == number for name, number in last.items())]
+
+
+def settled(metrics: Metrics, lessons: Iterable[str]) -> Metrics:
+    """Return the rows but for the first 200 episodes of each later lesson; `lessons`: columns.
 
     The first episodes to end there began before, or are short by luck (see RecentEpisodes.begin_anew).
     """
-    rows = [row for row in metrics if all(row[name] == number for name, number in last.items())]
-    if not last or not rows:
-        return rows
-    return [row for row in rows if row["episodes"] - rows[0]["episodes"] >= 2 * EPISODES]
+    rows: Metrics = []
+    lesson, first = None, -math.inf  # of now, and the episodes that had ended when it began
+    for row in metrics:
+        now = [row[name] for name in lessons]
+        if now != lesson:
+            lesson, first = now, -math.inf if lesson is None else row["episodes"]
+        if row["episodes"] - first >= 2 * EPISODES:
+            rows.append(row)
+    return rows
 
 
 def columns_of(metrics: Metrics, reached: dict[str, int | float] | None) -> dict[str, object]:

@@ -10,6 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 import compare_critics
+from decisions_to import settled, with_value
 from learn_scene import append
 
 from mappo_unity.config.compose import compose_config
@@ -94,7 +95,7 @@ def test_a_curve_leaves_out_the_first_episodes_of_each_later_lesson() -> None:
     nan = float("nan")
     values = [(50, 0, 9.0), (150, 0, 1.0), (200, 1, nan), (300, 1, 9.0), (450, 1, 2.0), (500, 2, 9.0)]
     metrics = [{"episodes": e, "lesson/g": n, "group_return_mean": v} for e, n, v in values]
-    rows = compare_critics.settled(metrics, ["lesson/g"])
+    rows = with_value(settled(metrics, ["lesson/g"]), "group_return_mean")
     assert [row["group_return_mean"] for row in rows] == [1.0, 2.0]
 
 
