@@ -3,9 +3,10 @@
 
 MAPPO's central critic, independent learners' local one (IPPO), MA-POCA's and attention; all else is the
 preset of the scene. With fewer --steps than the preset's its entropy bonus and learning rate fall as in its
-beginning. Of a preset with lessons the table's returns are of the last one, and the picture shows how far a
-seed has come, too. Runs lie in OUT/SCENE-CRITIC-SEED and are resumed after any interruption; what was trained
-is appended to docs/benchmarks/critics.csv and is not run again. Table and picture stand on the scene's page.
+beginning. The table has what the final checkpoints earn in the scene as it is (of a preset with lessons: in
+the last one, wherever a seed has come to), the picture the way there. Runs lie in OUT/SCENE-CRITIC-SEED and
+are resumed after any interruption; what was trained and played is appended to docs/benchmarks/critics.csv and
+critics_played.csv and is not run again. Table and picture stand on the scene's page.
 
     python scripts/compare_critics.py DungeonEscape [--critics central local] [--seeds 0 1 2] [--steps N]
     python scripts/compare_critics.py --draw                  # only the tables and the pictures
@@ -25,9 +26,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from decisions_to import last_lessons, settled, with_value
-from learn_scene import append, read_rows, thin
+from learn_scene import append, mappo_eval, read_rows, thin
+from score_measures import measures_of
 from score_page import BENCHMARKS, ROOT, put_between
-from score_table import train
+from score_table import last_lesson, train
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.runs.metrics_csv import read_metrics
@@ -41,10 +43,11 @@ CRITICS = {
     "attention": ("attention", "tab:red"),
 }
 CURVES = BENCHMARKS / "critics.csv"
+PLAYED = BENCHMARKS / "critics_played.csv"
 PAGES = ROOT / "docs/scenes"
 BEGIN, END = "<!-- critics -->\n", "<!-- end of critics -->\n"
 POINTS = 60  # of a curve
-NOT_THERE = "-"  # in place of a return: of seeds that did not come to the last lesson
+NOT_THERE = "-"  # in place of a return: of runs that have not been played
 
 
 class Point(NamedTuple):
@@ -62,6 +65,8 @@ class Point(NamedTuple):
 
 Curves = dict[str, dict[str, list[Point]]]
 """Curves by critic and seed."""
+Earned = dict[tuple[str, str, str], float]
+"""Group returns in the scene as it is, by scene, critic and seed."""
 
 
 def main() -> None:
@@ -84,16 +89,17 @@ def main() -> None:
     for scene, seed, critic in product(arguments.scenes, arguments.seeds, arguments.critics):
         if not arguments.draw:
             learn(arguments, scene, critic, seed)
+            play(arguments, scene, critic, seed)
 
     for scene, curves in read_curves().items():
-        write_page(scene, curves)
+        write_page(scene, curves, read_played())
         draw(scene, curves)
 
 
 def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> None:
     """Train one critic from one seed, unless that has been done, and append its curve."""
     key = scene, critic, str(seed)
-    if any((row["scene"], row["critic"], row["seed"]) == key for row in read_rows(CURVES)):
+    if any(key_of(row) == key for row in read_rows(CURVES)):
         return
     folder, load = arguments.out / "-".join(key), os.getloadavg()[0]
     steps = arguments.steps or SCENES[scene]
@@ -120,6 +126,43 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
     print(" ".join(f"{name}={value}" for name, value in point.items()), flush=True)
 
 
+def play(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> None:
+    """Play what a run ended with in the scene as it is, unless that has been done, and append the figure."""
+    key = scene, critic, str(seed)
+    if any(key_of(row) == key for row in read_rows(PLAYED)):
+        return
+    folder, load = arguments.out / "-".join(key), os.getloadavg()[0]
+    checkpoints = sorted((folder / "checkpoints").glob("step_*.pt"))
+    if not checkpoints:
+        print(f"{folder}: no checkpoint to play; its curve stands in {CURVES.name}, it was trained elsewhere")
+        return
+
+    # Of a run that was resumed for more steps the beginning counts.
+    steps = arguments.steps or SCENES[scene]
+    end = next((path for path in checkpoints if int(path.stem.split("_")[1]) >= steps), checkpoints[-1])
+    measure = measures_of(scene)[0]
+    said = mappo_eval(f"run={end}", f"episodes={measure.episodes}", *last_lesson(folder))
+    value, stderr = measure.figure(said)
+    row = {
+        "date": time.strftime("%Y-%m-%d"),
+        "scene": scene,
+        "critic": critic,
+        "seed": seed,
+        "decisions": int(end.stem.split("_")[1]),
+        "value": f"{value:.4g}",
+        "stderr": f"{stderr:.2g}",
+        "episodes": measure.episodes,
+        "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
+    }
+    append(PLAYED, row)
+    print(" ".join(f"{name}={value}" for name, value in row.items()), flush=True)
+
+
+def key_of(row: dict[str, str]) -> tuple[str, str, str]:
+    """Return of which run a row of a CSV is."""
+    return row["scene"], row["critic"], row["seed"]
+
+
 def options(scene: str, critic: str, steps: int) -> list[str]:
     """Return the options of a run that is the beginning of the preset's: what falls there falls as there."""
     preset = compose_config([f"env={scene}"]).config
@@ -141,18 +184,23 @@ def read_curves() -> dict[str, Curves]:
     return scenes
 
 
-def write_page(scene: str, curves: Curves) -> None:
+def read_played() -> Earned:
+    """Return what the final checkpoints earn in the scenes as they are."""
+    return {key_of(row): float(row["value"]) for row in read_rows(PLAYED)}
+
+
+def write_page(scene: str, curves: Curves, played: Earned) -> None:
     """Put the table onto the scene's page."""
-    names = ["critic", "seeds", "decisions", "group return, last tenth", "minutes of a million"]
+    names = ["critic", "seeds", "decisions", "group return", "minutes of a million"]
     if lessons_of(curves) > 1:
         names.insert(4, "lesson at the end")
     lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
 
     for critic, own in curves.items():
         ends = [points[-1] for _, points in sorted(own.items())]
-        earned = [at_the_end(points) for _, points in sorted(own.items())]
-        came = [value for value in earned if not math.isnan(value)]
-        mean = f"**{statistics.mean(came):.2f}**" if came else NOT_THERE
+        earned = [played.get((scene, critic, seed), math.nan) for seed in sorted(own)]
+        missing = any(map(math.isnan, earned))
+        mean = NOT_THERE if missing else f"**{statistics.mean(earned):.2f}**"
         each = ", ".join(NOT_THERE if math.isnan(value) else f"{value:.2f}" for value in earned)
         decisions = ", ".join(f"{steps / 1e6:.1f} M" for steps in sorted({end.decisions for end in ends}))
         pace = statistics.mean(1e6 * end.minutes / end.decisions for end in ends)
@@ -169,16 +217,6 @@ def write_page(scene: str, curves: Curves) -> None:
 def lessons_of(curves: Curves) -> int:
     """Return how many lessons the preset has."""
     return max(points[-1].lessons for own in curves.values() for points in own.values())
-
-
-def at_the_end(points: list[Point]) -> float:
-    """Return the mean of a curve's last tenth, nan if that is not in the last lesson.
-
-    One window of 100 episodes alone is luck.
-    """
-    begin = 0.9 * points[-1].decisions
-    last = [point.value for point in points if point.decisions >= begin and point.lesson == point.lessons]
-    return statistics.mean(last) if last else math.nan
 
 
 def draw(scene: str, curves: Curves) -> None:

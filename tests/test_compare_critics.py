@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from decisions_to import settled, with_value
 from learn_scene import append
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.runs.folder import write_record
 
 
 def test_the_tables_of_the_pages_are_those_of_the_trained_runs(
@@ -26,7 +28,7 @@ def test_the_tables_of_the_pages_are_those_of_the_trained_runs(
     for scene, curves in trained.items():
         written = (pages / f"{scene}.md").read_text(encoding="utf-8")
         (tmp_path / f"{scene}.md").write_text(written)
-        compare_critics.write_page(scene, curves)
+        compare_critics.write_page(scene, curves, compare_critics.read_played())
         again = (tmp_path / f"{scene}.md").read_text()
         assert again == written, "python scripts/compare_critics.py --draw writes it anew"
 
@@ -45,38 +47,67 @@ def test_every_critic_is_trained_by_the_presets_schedule(scene: str, critic: str
 
 
 def test_a_row_has_the_seeds_of_a_critic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each seed counts with the mean of its last tenth, if that is in the last lesson."""
-    row = {
+    """There is a mean where each seed has been played."""
+    end = {
         "scene": "DungeonEscape",
         "critic": "local",
         "seed": 0,
-        "decisions": 500_000,
-        "minutes": 1,
+        "decisions": 1_000_000,
+        "minutes": 3,
         "value": 0,
         "lesson": 2,
         "lessons": 2,
     }
-    end = {**row, "decisions": 1_000_000, "minutes": 3}
-    rows = [row, {**end, "decisions": 950_000, "value": 0.2}, {**end, "value": 0.4}]
-    rows += [{**end, "seed": 1, "value": 0.5}, {**end, "critic": "central", "minutes": 2, "value": 0.6}]
-    rows += [{**end, "seed": seed, "critic": "poca", "value": 0.9, "lesson": 1} for seed in (0, 1)]
-    for line in rows:
-        append(tmp_path / "critics.csv", line)
+    rows = [{**end, "decisions": 500_000, "lesson": 1}, end, {**end, "seed": 1, "lesson": 1}]
+    rows += [{**end, "critic": "central", "minutes": 2}]
+    rows += [{**end, "critic": "poca", "seed": seed} for seed in (0, 1)]
+    for row in rows:
+        append(tmp_path / "critics.csv", row)
+    for critic, seed, value in (("local", 0, 0.3), ("local", 1, 0.5), ("central", 0, 0.6), ("poca", 1, 0.9)):
+        played = {"scene": "DungeonEscape", "critic": critic, "seed": seed, "value": value}
+        append(tmp_path / "critics_played.csv", played)
     page = tmp_path / "DungeonEscape.md"
     page.write_text(f"before\n{compare_critics.BEGIN}old\n{compare_critics.END}after\n")
     monkeypatch.setattr(compare_critics, "CURVES", tmp_path / "critics.csv")
+    monkeypatch.setattr(compare_critics, "PLAYED", tmp_path / "critics_played.csv")
     monkeypatch.setattr(compare_critics, "PAGES", tmp_path)
 
     [(scene, curves)] = compare_critics.read_curves().items()
-    compare_critics.write_page(scene, curves)
+    compare_critics.write_page(scene, curves, compare_critics.read_played())
     lines = page.read_text().splitlines()
     assert (lines[0], lines[-1]) == ("before", "after") and "old" not in lines
     rows = [
         "| central (MAPPO) | 0 | 1.0 M | **0.60** (0.60) | 2 of 2 | 2.0 |",
-        "| local (IPPO) | 0, 1 | 1.0 M | **0.40** (0.30, 0.50) | 2, 2 of 2 | 3.0 |",
-        "| MA-POCA | 0, 1 | 1.0 M | - (-, -) | 1, 1 of 2 | 3.0 |",
+        "| local (IPPO) | 0, 1 | 1.0 M | **0.40** (0.30, 0.50) | 2, 1 of 2 | 3.0 |",
+        "| MA-POCA | 0, 1 | 1.0 M | - (-, 0.90) | 2, 2 of 2 | 3.0 |",
     ]
     assert lines[-5:-2] == rows
+
+
+def test_the_checkpoint_at_the_runs_end_is_played_in_the_last_lesson(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a run that went on its later ones are not; what has been played is not played again."""
+    folder = tmp_path / "CooperativePushBlock-local-3"
+    (folder / "checkpoints").mkdir(parents=True)
+    for steps in (900, 1000, 1100):
+        (folder / "checkpoints" / f"step_{steps:012d}.pt").touch()
+    write_record(folder, compose_config(["env=CooperativePushBlock"]).config, [])
+    monkeypatch.setattr(compare_critics, "PLAYED", tmp_path / "critics_played.csv")
+    asked = []
+
+    def mappo_eval(*options: str) -> dict[str, float]:
+        asked.append(options)
+        return {"mean_return": 4.5, "mean_group_return": 9.25, "stderr": 0.125}
+
+    monkeypatch.setattr(compare_critics, "mappo_eval", mappo_eval)
+    arguments = argparse.Namespace(out=tmp_path, steps=950)
+    for _ in range(2):
+        compare_critics.play(arguments, "CooperativePushBlock", "local", 3)
+
+    end = folder / "checkpoints" / "step_000000001000.pt"
+    assert asked == [(f"run={end}", "episodes=400", "env.params.gravity=14.715")]
+    assert compare_critics.read_played() == {("CooperativePushBlock", "local", "3"): 9.25}
 
 
 def test_a_scene_without_lessons_has_no_column_of_them(
@@ -85,7 +116,8 @@ def test_a_scene_without_lessons_has_no_column_of_them(
     (tmp_path / "DungeonEscape.md").write_text("")
     monkeypatch.setattr(compare_critics, "PAGES", tmp_path)
     point = compare_critics.Point(1e6, 2.0, 0.6, lesson=1, lessons=1)
-    compare_critics.write_page("DungeonEscape", {"central": {"0": [point]}})
+    played = {("DungeonEscape", "central", "0"): 0.6}
+    compare_critics.write_page("DungeonEscape", {"central": {"0": [point]}}, played)
     page = (tmp_path / "DungeonEscape.md").read_text()
     assert "| central (MAPPO) | 0 | 1.0 M | **0.60** (0.60) | 2.0 |" in page and "lesson" not in page
 
