@@ -32,6 +32,7 @@ from score_page import BENCHMARKS, ROOT, put_between
 from score_table import last_lesson, train
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.runs.checkpoint_file import checkpoints_in, step_of
 from mappo_unity.runs.metrics_csv import read_metrics
 
 SCENES = {"CooperativePushBlock": 2_500_000, "DungeonEscape": 2_000_000}
@@ -91,8 +92,9 @@ def main() -> None:
             learn(arguments, scene, critic, seed)
             play(arguments, scene, critic, seed)
 
+    played = read_played()
     for scene, curves in read_curves().items():
-        write_page(scene, curves, read_played())
+        write_page(scene, curves, played)
         draw(scene, curves)
 
 
@@ -129,17 +131,17 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
 def play(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> None:
     """Play what a run ended with in the scene as it is, unless that has been done, and append the figure."""
     key = scene, critic, str(seed)
-    if any(key_of(row) == key for row in read_rows(PLAYED)):
+    if key in read_played():
         return
     folder, load = arguments.out / "-".join(key), os.getloadavg()[0]
-    checkpoints = sorted((folder / "checkpoints").glob("step_*.pt"))
+    checkpoints = checkpoints_in(folder)
     if not checkpoints:
         print(f"{folder}: no checkpoint to play; its curve stands in {CURVES.name}, it was trained elsewhere")
         return
 
     # Of a run that was resumed for more steps the beginning counts.
     steps = arguments.steps or SCENES[scene]
-    end = next((path for path in checkpoints if int(path.stem.split("_")[1]) >= steps), checkpoints[-1])
+    end = next((path for path in checkpoints if step_of(path) >= steps), checkpoints[-1])
     measure = measures_of(scene)[0]
     said = mappo_eval(f"run={end}", f"episodes={measure.episodes}", *last_lesson(folder))
     value, stderr = measure.figure(said)
@@ -148,7 +150,7 @@ def play(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> N
         "scene": scene,
         "critic": critic,
         "seed": seed,
-        "decisions": int(end.stem.split("_")[1]),
+        "decisions": step_of(end),
         "value": f"{value:.4g}",
         "stderr": f"{stderr:.2g}",
         "episodes": measure.episodes,

@@ -297,7 +297,7 @@ def test_the_colour_of_the_largest_entity_is_learned(tmp_path):
 @pytest.mark.parametrize("critic", [CriticKind.central, CriticKind.attention, CriticKind.poca])
 def test_teams_learn_it_with_the_critics_of_teams(critic, tmp_path):
     """After it is known (six batches), advantages are noise: many more updates may unlearn it by chance."""
-    assert learned("LargestTeam", tmp_path, 12, lr=1e-3, critic=critic) > 0.5
+    assert learned("LargestTeam", tmp_path, 12, lr=1e-3, critic=critic) > 0.6
 
 
 @pytest.mark.parametrize("kind", GoalKind)
