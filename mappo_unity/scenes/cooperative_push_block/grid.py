@@ -18,8 +18,10 @@ CELL_HALF = 0.5  # m
 CENTRE_AHEAD = 10.0  # m
 WALL, AGENT, GOAL, SMALL, LARGE, VERY_LARGE = range(6)
 NUM_TAGS = 6
+NOTHING = -1
 INNER, OUTER = 12.5, 13.0  # m: faces of the walls
 GOAL_LOW, GOAL_HIGH, GOAL_HALF_X = -12.65, -8.35, 12.5  # m: z, z, x
+_EACH_TAG = np.arange(NUM_TAGS, dtype=np.int8)[:, None, None]
 _RIGHT = (CELLS - 1) / 2 - np.arange(CELLS)  # m, of h
 _AHEAD = np.arange(CELLS) + CELL_HALF  # m, of w
 
@@ -61,20 +63,21 @@ def look(
     parts = [_walls(view, x, z), _goal(view, x, z), _bodies(view, x, z, place, yaw, half, tag, seen)]
 
     cell, tags = np.concatenate([part.cell for part in parts]), np.concatenate([part.tag for part in parts])
-    point = np.concatenate([part.point for part in parts], axis=1)
+    winner = np.full(x.size, NOTHING, np.int8)
+    winner[cell] = tags
+
+    # Where several things lie, written from the farthest to the nearest: the last one stays.
+    contested = (np.bincount(cell, minlength=x.size)[cell] > 1).nonzero()[0]
+    point = np.concatenate([part.point for part in parts], axis=1)[:, contested]
+    cell, tags = cell[contested], tags[contested]
     agent = cell // CELLS**2
     away_x = point[0] - (view.x + CENTRE_AHEAD * view.sin)[agent]
     away_z = point[1] - (view.z + CENTRE_AHEAD * view.cos)[agent]
-
-    # Written from the farthest to the nearest: the last one stays.
     order = np.argsort(-(away_x * away_x + away_z * away_z), kind="stable")
-    winner = np.full(x.size, -1)
     winner[cell[order]] = tags[order]
-    cells = np.flatnonzero(winner >= 0)
-    grid = np.zeros((len(view.x), NUM_TAGS, CELLS**2), np.float32)
-    agent, inside = np.divmod(cells, CELLS**2)
-    grid[agent, winner[cells], inside] = 1.0
-    return grid.reshape(-1, NUM_TAGS, CELLS, CELLS)
+
+    grid = winner.reshape(-1, 1, CELLS, CELLS) == _EACH_TAG
+    return grid.astype(np.float32)
 
 
 def _walls(view: View, x: np.ndarray, z: np.ndarray) -> Painted:

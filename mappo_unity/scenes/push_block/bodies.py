@@ -15,13 +15,13 @@ import numpy as np
 from mappo_unity.scenes.core.ground import BOX_FRICTION, TICK_S
 from mappo_unity.scenes.push_block.contacts import (
     Outlines,
-    Pairs,
     Room,
     joined,
     meet,
     near_pairs,
-    outlines,
     pair_contacts,
+    plan_extents,
+    turns_of,
     wall_contacts,
 )
 from mappo_unity.scenes.push_block.solver import Floor, solve
@@ -79,7 +79,7 @@ class SlidingBoxes:
         self._mass = np.asarray(mass, float)
         self._turns = np.asarray(turns, bool)
         self._any_turns = bool(self._turns.any())
-        self._pairs = np.array(np.triu_indices(len(mass), 1))
+        self._table = np.zeros((*shape, 4), complex)
         self._weigh()
 
     def step(self, drive: np.ndarray) -> None:
@@ -93,7 +93,7 @@ class SlidingBoxes:
         landed = self._land()
 
         boxes, turns = self.outlines(), self._turns
-        contacts, near = pair_contacts(boxes, self._pairs, motion, turns)
+        contacts, near = pair_contacts(boxes, motion, turns)
         contacts = joined(contacts, wall_contacts(boxes, self.room, motion, turns))
         solve(contacts, motion, self._weight, self._floor(landed))
 
@@ -109,15 +109,18 @@ class SlidingBoxes:
 
     def outlines(self) -> Outlines:
         """Return where the boxes are, seen from above."""
-        return outlines(self.place, self.yaw, self.half, self._radius, self.present)
+        table, turn = self._table, turns_of(self.yaw)
+        table[..., 0], table[..., 1] = self.place.view(complex)[..., 0], turn
+        radius = np.where(self.present, self._radius, -np.inf)
+        return Outlines(table, self.place, plan_extents(turn, self.half), radius, self.present)
 
     def deepest(self) -> np.ndarray:
         """Return the deepest overlap of any two boxes of an area, or of a box and a wall, [N] m."""
         boxes = self.outlines()
         beyond = np.maximum(self.room.low - self.place, self.place - self.room.high) + boxes.extent
         depth: np.ndarray = np.where(self.present[..., None], beyond, 0.0).max(axis=(1, 2)).clip(0.0)
-        near = near_pairs(boxes, self._pairs, 0.0)
-        np.maximum.at(depth, near.area, -meet(boxes, near).gap)
+        near = near_pairs(boxes, 0.0)
+        np.maximum.at(depth, near[:, 0], -meet(boxes, near).gap)
         return depth
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -137,6 +140,9 @@ class SlidingBoxes:
         self._weight = np.empty(self.motion.shape)
         self._weight[..., :2] = (1.0 / self._mass)[:, None]
         self._weight[..., 2] = self._turns / inertia
+
+        half = self.half.view(complex)[..., 0]
+        self._table[..., 2], self._table[..., 3] = half, 1j * half.conj()
 
         # Spin by speed lost to the floor: the two friction anchors of a face stand in opposite corners.
         self._radius = np.sqrt((self.half**2).sum(axis=2))
@@ -166,28 +172,31 @@ class SlidingBoxes:
         rub = self.rub * landed
         return Floor(self.hold * landed, rub, rub * self._grip)
 
-    def _separate(self, near: Pairs) -> None:
-        """Push overlapping boxes apart, the lighter one farther, and all of them into the room."""
+    def _separate(self, pairs: np.ndarray) -> None:
+        """Push overlapping boxes apart, the lighter one farther, and all of them into the room.
+
+        `pairs` int [K, 3]: area and bodies of those that were near before they moved.
+        """
         boxes = self.outlines()
         self.extent = boxes.extent
         low, high = self.room.low + boxes.extent, self.room.high - boxes.extent
         self._stay_inside(low, high)
-        if not near.area.size:
+        if not len(pairs):
             return
 
         widened = False
         for _ in range(PUSH_ROUNDS):
-            boxes.table[..., :2] = self.place
-            meeting = meet(boxes, near)
+            boxes.table[..., 0] = self.place.view(complex)[..., 0]
+            meeting = meet(boxes, pairs)
             deep = (meeting.gap < -DEEP).nonzero()[0]
             if not deep.size:
                 break
             if not widened and meeting.gap.min() < -FAR_IN:
-                near, widened = near_pairs(boxes, self._pairs, REACH), True
+                pairs, widened = near_pairs(boxes, REACH), True
                 continue
 
-            area, one, other = near.at(deep)
-            way = (meeting.normal[:, deep] * -meeting.gap[deep]).T
+            area, one, other = pairs[deep].T
+            way = (meeting.normal[deep] * -meeting.gap[deep]).view(float).reshape(-1, 2)
             share = (self._mass[other] / (self._mass[one] + self._mass[other]))[:, None]
             np.add.at(self.place, (area, one), way * share)
             np.add.at(self.place, (area, other), way * (share - 1.0))

@@ -5,7 +5,7 @@ the normal impulses of all contacts, then their friction, then the floor's frict
 have left. The floor's friction is part of the rounds, so that a heavy box stays where it is while the pushes
 against it are less than the floor can hold. Contacts of a body share its mass, so that their impulses cannot
 add up to too much.
-Legend: N areas, B bodies of an area, K contacts, n areas with contacts, C the most contacts of one of them.
+Legend: N areas, B bodies of an area, K contacts, C the most contacts of an area.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ WALL = -1  # instead of a body's number
 
 
 class Contacts(NamedTuple):
-    """Points where bodies may touch within the tick; x and z only."""
+    """Points where bodies may touch within the tick; vectors are x + iz."""
 
     area: np.ndarray
     """int [K]."""
@@ -32,11 +32,11 @@ class Contacts(NamedTuple):
     other: np.ndarray
     """int [K]: body of the area, or WALL."""
     normal: np.ndarray
-    """[2, K]: unit vector (x, z) from the other to the one."""
+    """complex [K]: unit vector from the other to the one."""
     arm: np.ndarray
-    """[2, K], m: from the one's centre to the point."""
+    """complex [K], m: from the one's centre to the point."""
     other_arm: np.ndarray
-    """[2, K], m: from the other's centre to the point; anything for walls."""
+    """complex [K], m: from the other's centre to the point; anything for walls."""
     gap: np.ndarray
     """[K], m: may be closed within the tick; negative where they overlap."""
 
@@ -57,13 +57,11 @@ class Floor(NamedTuple):
 
     def limited(self, change: np.ndarray) -> np.ndarray:
         """Return a change of motion [..., B, 3] (x, z, spin) as far as friction can make it."""
-        x, z, spin = change[..., 0], change[..., 1], change[..., 2]
-        speed = np.sqrt(x * x + z * z)
+        speed = np.hypot(change[..., 0], change[..., 1])
         share = np.where(speed <= self.hold, 1.0, self.rub / np.maximum(speed, 1e-12))
         limited = np.empty(change.shape)
-        np.multiply(x, share, out=limited[..., 0])
-        np.multiply(z, share, out=limited[..., 1])
-        np.minimum(np.maximum(spin, -self.turn), self.turn, out=limited[..., 2])
+        np.multiply(change[..., :2], share[..., None], out=limited[..., :2])
+        np.minimum(np.maximum(change[..., 2], -self.turn), self.turn, out=limited[..., 2])
         return limited
 
 
@@ -77,119 +75,86 @@ def solve(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Flo
         motion += floor.limited(-motion)
         return
 
-    met = np.zeros(len(motion), bool)
-    met[contacts.area] = True
-    areas = met.nonzero()[0]
-    local = (met.cumsum() - 1)[contacts.area]
-    count, bodies = len(areas), motion.shape[1]
-    place = _places(local)
-    width = int(place.max()) + 1
+    count, bodies, _ = motion.shape
+    place = _places(contacts.area)
+    rows = _rows(contacts, place, (count, int(place.max()) + 1, bodies))
+    answers = rows * weight.reshape(count, 1, -1)
 
-    along, across = _rows(contacts, local, place, (count, width, bodies))
-    share = _shares(contacts, local, (count, bodies))
-    light = weight[areas].reshape(count, 1, -1)
-    push, rub = along * light, across * light
-    spread = np.repeat(share, 3, axis=1)[:, None]
-    mass = _inverse((along * push * spread).sum(axis=2))
-    rub_mass = _inverse((across * rub * spread).sum(axis=2))
+    # Scaled by the masses at the contacts, rows turn motions into the impulses that would stop them.
+    shared = rows * _shares(contacts, (count, bodies))
+    masses = (answers * shared).sum(axis=3)
+    masses = np.where(masses > 0, 1.0 / np.maximum(masses, 1e-12), 0.0)
+    masses[0] *= HASTE
+    rows *= masses[..., None]
 
-    allowed = np.zeros((count, width))  # m/s of approach that only closes a gap
-    allowed[local, place] = np.maximum(contacts.gap, 0.0) / TICK_S
-
-    # All other areas have only the floor.
-    touched = motion[areas]
-    if count < len(motion):
-        motion += floor.limited(-motion)
-    motion[areas] = _rounds(touched, (along, across), (push, rub), (mass, rub_mass), allowed, floor.at(areas))
+    allowed = masses[0]  # for approach that only closes a gap
+    closing = np.zeros(allowed.shape)
+    closing[contacts.area, place] = np.maximum(contacts.gap, 0.0) / TICK_S
+    _rounds(motion, rows, answers, allowed * closing, floor)
 
 
 def _rounds(
-    motion: np.ndarray,
-    rows: tuple[np.ndarray, np.ndarray],
-    answers: tuple[np.ndarray, np.ndarray],
-    masses: tuple[np.ndarray, np.ndarray],
-    allowed: np.ndarray,
-    floor: Floor,
-) -> np.ndarray:
-    """Return the motion [n, B, 3] after all impulses; rows, answers [n, C, 3 B], masses, allowed [n, C]."""
-    (along, across), (push, rub), (mass, rub_mass) = rows, answers, masses
-    shape = motion.shape
-    flat = motion.reshape(len(motion), 1, -1).copy()
-    column = flat.transpose(0, 2, 1)  # a view
-    impulse, friction = np.zeros_like(allowed), np.zeros_like(allowed)
-    held = np.zeros(shape)  # what the floor has taken so far
+    motion: np.ndarray, rows: np.ndarray, answers: np.ndarray, allowed: np.ndarray, floor: Floor
+) -> None:
+    """Add what all impulses do to the motion [N, B, 3].
+
+    `rows` [2, N, C, 3 B]: normal impulses by motion, and those of friction; `answers` [2, N, C, 3 B]: motion
+    by impulse; `allowed` [N, C]: what normal impulses may lack, kg m/s.
+    """
+    (along, across), (push, rub) = rows.swapaxes(2, 3), answers
+    flat, allowed = motion.reshape(len(motion), 1, -1), allowed[:, None]  # the motion itself, in a row
+    impulse = friction = np.zeros(allowed.shape)
+    held = np.zeros(motion.shape)  # what the floor has taken so far
 
     for _ in range(ROUNDS):
         # An impulse may shrink again in a later round, but it never pulls.
-        approach = (along @ column)[:, :, 0] + allowed
-        grown = np.maximum(impulse - HASTE * approach * mass, 0.0)
+        grown = np.maximum(impulse - flat @ along - allowed, 0.0)
         change = grown - impulse
         impulse = grown
-        flat += change[:, None] @ push
+        flat += change @ push
 
-        slip = (across @ column)[:, :, 0]
         limit = BOX_FRICTION * impulse
-        rubbed = np.minimum(np.maximum(friction - slip * rub_mass, -limit), limit)
-        flat += (rubbed - friction)[:, None] @ rub
+        rubbed = np.minimum(np.maximum(friction - flat @ across, -limit), limit)
+        flat += (rubbed - friction) @ rub
         friction = rubbed
 
-        taken = floor.limited(held - flat.reshape(shape))
-        flat += (taken - held).reshape(flat.shape)
+        taken = floor.limited(held - motion)
+        motion += taken - held
         held = taken
         if np.abs(change).max() < NEGLIGIBLE:
             break
 
-    return flat.reshape(shape)
 
-
-def _rows(
-    contacts: Contacts, local: np.ndarray, place: np.ndarray, shape: tuple[int, int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return what turns motions into speeds at the contacts, [n, C, 3 B]: along the normals, across them."""
-    count, width, bodies = shape
-    paired = (contacts.other != WALL).nonzero()[0]
-    (x, z), (right, ahead) = contacts.normal, contacts.arm
-    other_right, other_ahead = contacts.other_arm[:, paired]
-    other_x, other_z = x[paired], z[paired]
+def _rows(contacts: Contacts, place: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """Return what turns motions into speeds at contacts, [2, N, C, 3 B]: along the normals, across them."""
+    (count, width, bodies), normal = shape, contacts.normal
+    lever = normal.conj() * np.array((contacts.arm, contacts.other_arm))
 
     # Speed of a point at an arm (r_x, r_z): v_x + spin * r_z, v_z - spin * r_x.
-    rows = np.zeros((2, count, width, bodies, 3))
-    mine = np.empty((2, len(x), 3))
-    mine[0, :, 0], mine[0, :, 1], mine[0, :, 2] = x, z, x * ahead - z * right
-    mine[1, :, 0], mine[1, :, 1], mine[1, :, 2] = z, -x, z * ahead + x * right
-    rows[:, local, place, contacts.one] = mine
+    each = np.empty((2, *lever.shape, 3))
+    each[0, ..., 0], each[0, ..., 1], each[0, ..., 2] = normal.real, normal.imag, lever.imag
+    each[1, ..., 0], each[1, ..., 1], each[1, ..., 2] = normal.imag, -normal.real, lever.real
 
-    theirs = np.empty((2, len(paired), 3))
-    theirs[0, :, 0], theirs[0, :, 1] = -other_x, -other_z
-    theirs[0, :, 2] = other_z * other_right - other_x * other_ahead
-    theirs[1, :, 0], theirs[1, :, 1] = -other_z, other_x
-    theirs[1, :, 2] = -other_z * other_ahead - other_x * other_right
-    rows[:, local[paired], place[paired], contacts.other[paired]] = theirs
-
-    along, across = rows.reshape(2, count, width, -1)
-    return along, across
+    # Walls have the last column, which is cut off.
+    rows = np.zeros((2, count, width, bodies + 1, 3))
+    rows[:, contacts.area, place, contacts.one] = each[:, 0]
+    rows[:, contacts.area, place, contacts.other] = -each[:, 1]
+    return rows[:, :, :, :bodies].reshape(2, count, width, -1)
 
 
-def _shares(contacts: Contacts, local: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return [n, B]: how many contacts a body has, at least 1."""
+def _shares(contacts: Contacts, shape: tuple[int, int]) -> np.ndarray:
+    """Return [N, 1, 3 B]: how many contacts a body has, at least 1, for each part of its motion."""
     count, bodies = shape
-    first = local * bodies
-    paired = contacts.other != WALL
-    share = np.bincount(first + contacts.one, minlength=count * bodies)
-    share += np.bincount((first + contacts.other)[paired], minlength=count * bodies)
-    return np.maximum(share, 1).reshape(shape)
+    first = contacts.area * (bodies + 1) + 1  # the first column is that of the walls
+    touched = np.concatenate((first + contacts.one, first + contacts.other))
+    share = np.maximum(np.bincount(touched, minlength=count * (bodies + 1)), 1.0)
+    return np.repeat(share.reshape(count, 1, -1)[..., 1:], 3, axis=2)
 
 
-def _places(local: np.ndarray) -> np.ndarray:
+def _places(area: np.ndarray) -> np.ndarray:
     """Return int [K]: the place of each contact among those of its area."""
-    order = np.argsort(local, kind="stable")
-    ordered = local[order]
-    starts = np.searchsorted(ordered, ordered)
-    place = np.empty_like(local)
-    place[order] = np.arange(len(local)) - starts
+    order = np.argsort(area, kind="stable")
+    ordered = area[order]
+    place = np.empty_like(area)
+    place[order] = np.arange(len(area)) - np.searchsorted(ordered, ordered)
     return place
-
-
-def _inverse(values: np.ndarray) -> np.ndarray:
-    """Return 1 / values, 0 where there is no contact."""
-    return np.where(values > 0, 1.0 / np.maximum(values, 1e-12), 0.0)
