@@ -51,10 +51,6 @@ class Floor(NamedTuple):
     turn: np.ndarray
     """The most spin that it takes."""
 
-    def at(self, areas: np.ndarray) -> Floor:
-        """Return the limits of some areas."""
-        return Floor(self.hold[areas], self.rub[areas], self.turn[areas])
-
     def limited(self, change: np.ndarray) -> np.ndarray:
         """Return a change of motion [..., B, 3] (x, z, spin) as far as friction can make it."""
         speed = np.hypot(change[..., 0], change[..., 1])
@@ -87,10 +83,9 @@ def solve(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Flo
     masses[0] *= HASTE
     rows *= masses[..., None]
 
-    allowed = masses[0]  # for approach that only closes a gap
-    closing = np.zeros(allowed.shape)
-    closing[contacts.area, place] = np.maximum(contacts.gap, 0.0) / TICK_S
-    _rounds(motion, rows, answers, allowed * closing, floor)
+    allowed = np.zeros(masses[0].shape)  # approach that only closes a gap, m/s
+    allowed[contacts.area, place] = np.maximum(contacts.gap, 0.0) / TICK_S
+    _rounds(motion, rows, answers, masses[0] * allowed, floor)
 
 
 def _rounds(
