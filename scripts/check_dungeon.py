@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Count the areas of DungeonEscape that a policy frees, over all and by the platform's quarter turn.
+"""Count the areas of DungeonEscape that a policy frees: over all, by quarter turn, and by the dragon's speed.
 
     scripts/check_dungeon.py --policy DungeonEscape.onnx [--episodes 800] [--num-areas 64] [--seed 0]
     scripts/check_dungeon.py --policy random
@@ -12,21 +12,35 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mappo_unity.policies.evaluate import open_policy
+from mappo_unity.scenes.core.ground import TICK_S
 from mappo_unity.scenes.dungeon_escape.layout import DRAGON, DRAGON_START_YAW
 from mappo_unity.scenes.dungeon_escape.scene import DungeonEscape
 
+SPEEDS, SPEED_STEP = (1, 3, 5), 2  # m/s
+
+
+class Outcome(NamedTuple):
+    """How an area's episode went."""
+
+    turn: int
+    """Quarter turn of the platform."""
+    speed: float
+    """Of the dragon, m/s."""
+    seconds: float
+    freed: bool
+
 
 class CountingDungeon(DungeonEscape):
-    """Note how every area's episode ended; `outcomes`: (quarter turn, freed)."""
+    """Note how every area's episode ended, in `outcomes`."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.outcomes: list[tuple[int, bool]] = []
+        self.outcomes: list[Outcome] = []
         self._turn = np.zeros(self.num_areas, int)
         self._freed = np.zeros(self.num_areas, bool)
 
@@ -36,8 +50,8 @@ class CountingDungeon(DungeonEscape):
 
     def _reset_areas(self, areas: np.ndarray) -> None:
         if self.started:
-            pairs = zip(self._turn[areas].tolist(), self._freed[areas].tolist(), strict=True)
-            self.outcomes += list(pairs)
+            parts = self._turn, self.room.dragon_speed, self.timer * TICK_S, self._freed
+            self.outcomes += map(Outcome, *(part[areas].tolist() for part in parts))
         self._freed[areas] = False
         super()._reset_areas(areas)
         yaw = self.room.thing_yaw[areas, DRAGON]
@@ -63,11 +77,19 @@ def main() -> None:
             if len(decisions):
                 env.set_actions(name, policy.act(name, decisions, spec))
         env.step()
-    turns, freed = map(np.array, zip(*env.outcomes, strict=True))
+    turn, speed, seconds, freed = map(np.array, zip(*env.outcomes, strict=True))
     print(f"{Path(options.policy).name}, seed {options.seed}: {freed.mean():.1%} of {len(freed)} areas freed")
-    for turn in range(4):
-        of_turn = freed[turns == turn]
-        print(f"  quarter turn {turn}: {of_turn.mean():.3f} of {len(of_turn)}")
+    for number in range(4):
+        of_turn = freed[turn == number]
+        print(f"  quarter turn {number}: {of_turn.mean():.3f} of {len(of_turn)}")
+
+    # At quarter turns 2 and 3 the portal is 12.1 m from the dragon, else 22.8 m.
+    for way, ways in (("short", turn >= 2), ("long", turn < 2)):
+        for slowest in SPEEDS:
+            rows = ways & (speed >= slowest) & (speed < slowest + SPEED_STEP)
+            share, lasting = (values[rows].mean() if rows.any() else np.nan for values in (freed, seconds))
+            speeds = f"{slowest} to {slowest + SPEED_STEP} m/s"
+            print(f"  {way} way, dragon at {speeds}: {share:.3f} of {rows.sum()}, {lasting:.1f} s each")
 
 
 if __name__ == "__main__":
