@@ -23,7 +23,7 @@ SIZES = ((384, 6), (320, 6), (272, 6), (240, 6), (208, 6), (240, 4))
 """Widths, in the shape of docs/scenes/NAME.png, and seconds."""
 LARGEST = 850_000  # bytes
 SEEDS = {"CooperativePushBlock": 10, "Pyramids": 45}
-"""Of the scenes; 1 for all others. This one's whole episode fits into the film."""
+"""Of the scenes; 1 for all others. Three agents push a very large block home; a whole episode fits in."""
 PLACE = Path(__file__).resolve().parents[1] / "docs/scenes"
 
 

@@ -16,6 +16,7 @@ from mappo_unity.scenes.core.ground import BOX_FRICTION, TICK_S
 from mappo_unity.scenes.push_block.contacts import (
     Outlines,
     Room,
+    as_complex,
     joined,
     meet,
     near_pairs,
@@ -110,7 +111,7 @@ class SlidingBoxes:
     def outlines(self) -> Outlines:
         """Return where the boxes are, seen from above."""
         table, turn = self._table, turns_of(self.yaw)
-        table[..., 0], table[..., 1] = self.place.view(complex)[..., 0], turn
+        table[..., 0], table[..., 1] = as_complex(self.place), turn
         radius = np.where(self.present, self._radius, -np.inf)
         return Outlines(table, self.place, plan_extents(turn, self.half), radius, self.present)
 
@@ -141,7 +142,7 @@ class SlidingBoxes:
         self._weight[..., :2] = (1.0 / self._mass)[:, None]
         self._weight[..., 2] = self._turns / inertia
 
-        half = self.half.view(complex)[..., 0]
+        half = as_complex(self.half)
         self._table[..., 2], self._table[..., 3] = half, 1j * half.conj()
 
         # Spin by speed lost to the floor: the two friction anchors of a face stand in opposite corners.
@@ -186,7 +187,7 @@ class SlidingBoxes:
 
         widened = False
         for _ in range(PUSH_ROUNDS):
-            boxes.table[..., 0] = self.place.view(complex)[..., 0]
+            boxes.table[..., 0] = as_complex(self.place)
             meeting = meet(boxes, pairs)
             deep = (meeting.gap < -DEEP).nonzero()[0]
             if not deep.size:

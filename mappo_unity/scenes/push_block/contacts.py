@@ -63,6 +63,11 @@ class Room(NamedTuple):
     """[2]: x, z."""
 
 
+def as_complex(vectors: np.ndarray) -> np.ndarray:
+    """Return a view complex [...] of vectors [..., 2] (x, z) that lie side by side in memory."""
+    return vectors.view(complex)[..., 0]
+
+
 def turns_of(yaw: np.ndarray) -> np.ndarray:
     """Return complex [...]: the right of boxes with that yaw [...], rad clockwise from above."""
     return np.asarray(np.exp(-1j * yaw))
@@ -105,7 +110,7 @@ def pair_contacts(boxes: Outlines, motion: np.ndarray, turns: np.ndarray) -> tup
     `motion` [N, B, 3]: velocity (m/s; the spin is not looked at). `turns` bool [B]: which bodies contacts
     turn; of a pair of others one point is enough.
     """
-    velocity = motion[..., :2].view(complex)[..., 0]
+    velocity = as_complex(motion[..., :2])
     pairs = near_pairs(boxes, np.abs(velocity) * TICK_S + CONTACT_GAP)
     meeting = meet(boxes, pairs)
     both = velocity[pairs[:, :1], pairs[:, 1:]]

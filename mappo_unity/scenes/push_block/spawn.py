@@ -54,11 +54,12 @@ def _overlaps(
 ) -> np.ndarray:
     """Return bool [n, T, B]: which bodies the boxes around spots [n, T, 2] overlap."""
     offset = place[:, None] - spot[:, :, None]
-    sin, cos = np.sin(yaw)[:, None], np.cos(yaw)[:, None]
+    turn = turns_of(yaw)[:, None]
+    sin, cos = -turn.imag, turn.real
     x, z = offset[..., 0], offset[..., 1]
 
     # Separating axes of two rectangles: the area's two, then the body's own two.
-    beside = np.abs(offset) < query + plan_extents(turns_of(yaw), half)[:, None]
+    beside = np.abs(offset) < query + plan_extents(turn, half[:, None])
     reach = query * (np.abs(sin) + np.abs(cos))
     right = np.abs(x * cos - z * sin) < half[:, None, :, 0] + reach
     ahead = np.abs(x * sin + z * cos) < half[:, None, :, 1] + reach
