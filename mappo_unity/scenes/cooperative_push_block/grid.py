@@ -4,7 +4,8 @@ Cell (h, w) is a square of 1 m, turned with the agent, with its middle at right 
 the agent: the grid's centre is 10 m ahead. Of several things in a cell the one wins whose bounding box
 (along the area's axes), at its point nearest to the cell's middle, is nearest to the grid's centre. Heights
 do not matter: cells reach half a metre up and down from the agent's centre, and so meet everything.
-Legend: n agents that look, M bodies of an area, P pairs of an agent and a body in its grid, K painted cells.
+Legend: n agents that look, M bodies of an area, P bodies in the grids of agents, K cells in
+which something lies.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+
+from mappo_unity.scenes.push_block.contacts import plan_extents, turns_of
 
 CELLS = 20
 CELL_HALF = 0.5  # m
@@ -21,6 +24,11 @@ NUM_TAGS = 6
 NOTHING = -1
 INNER, OUTER = 12.5, 13.0  # m: faces of the walls
 GOAL_LOW, GOAL_HIGH, GOAL_HALF_X = -12.65, -8.35, 12.5  # m: z, z, x
+GOAL_NUMBER = 4  # after the walls
+FIXED_TAGS = np.array([WALL] * 4 + [GOAL], np.int8)
+_LOW = (-OUTER, -OUTER), (INNER, -OUTER), (-INNER, -OUTER), (-INNER, INNER), (-GOAL_HALF_X, GOAL_LOW)
+_HIGH = (-INNER, OUTER), (OUTER, OUTER), (INNER, -INNER), (INNER, OUTER), (GOAL_HALF_X, GOAL_HIGH)
+FIXED_BOUNDS = np.array((_LOW, _HIGH)).swapaxes(1, 2)  # [2, 2, 5], m: low and high, x and z
 _EACH_TAG = np.arange(NUM_TAGS, dtype=np.int8)[:, None, None]
 _RIGHT = (CELLS - 1) / 2 - np.arange(CELLS)  # m, of h
 _AHEAD = np.arange(CELLS) + CELL_HALF  # m, of w
@@ -37,15 +45,17 @@ class View(NamedTuple):
     """Of the yaw, clockwise from above."""
 
 
-class Painted(NamedTuple):
-    """Cells that something lies in."""
+class Bodies(NamedTuple):
+    """Boxes in the grids, and the cells that they lie in."""
 
     cell: np.ndarray
     """int [K]: (agent * 20 + h) * 20 + w."""
+    pair: np.ndarray
+    """int [K]: whose cell it is."""
     tag: np.ndarray
-    """int [K]."""
-    point: np.ndarray
-    """[2, K]: x, z of the point that decides how near it is, m."""
+    """int8 [P]."""
+    bounds: np.ndarray
+    """[2, 2, P], m: low and high ends of their bounding boxes, x and z."""
 
 
 def look(
@@ -53,23 +63,31 @@ def look(
 ) -> np.ndarray:
     """Return the grids, float32 [n, 6, 20, 20].
 
-    `place`, `half` [n, M, 2], `yaw` [n, M]: the bodies of each looking agent's area; `tag` int [M]; `seen`
+    `place`, `half` [n, M, 2], `yaw` [n, M]: the bodies of each looking agent's area; `tag` int8 [M]; `seen`
     bool [n, M]: False leaves a body out.
     """
-    middle_x = view.x[:, None] + _RIGHT * view.cos[:, None], _AHEAD * view.sin[:, None]
-    middle_z = view.z[:, None] - _RIGHT * view.sin[:, None], _AHEAD * view.cos[:, None]
-    x = middle_x[0][:, :, None] + middle_x[1][:, None]
-    z = middle_z[0][:, :, None] + middle_z[1][:, None]
-    parts = [_walls(view, x, z), _goal(view, x, z), _bodies(view, x, z, place, yaw, half, tag, seen)]
+    middle = np.empty((2, len(view.x), CELLS, CELLS))
+    for part, start, right, ahead in ((0, view.x, view.cos, view.sin), (1, view.z, -view.sin, view.cos)):
+        rows = start[:, None] + _RIGHT * right[:, None]
+        np.add(rows[:, :, None], (_AHEAD * ahead[:, None])[:, None], out=middle[part])
 
-    cell, tags = np.concatenate([part.cell for part in parts]), np.concatenate([part.tag for part in parts])
-    winner = np.full(x.size, NOTHING, np.int8)
+    # Things are numbered: the fixed ones, then the bodies.
+    wall_cell, wall = _walls(view, middle)
+    goal_cell = _goal(view, middle)
+    goal = np.full(goal_cell.size, GOAL_NUMBER)
+    bodies = _bodies(view, place, yaw, half, tag, seen)
+
+    cell = np.concatenate((wall_cell, goal_cell, bodies.cell))
+    thing = np.concatenate((wall, goal, bodies.pair + len(FIXED_TAGS)))
+    tags = np.concatenate((FIXED_TAGS, bodies.tag))[thing]
+    winner = np.full(middle[0].size, NOTHING, np.int8)
     winner[cell] = tags
 
     # Where several things lie, written from the farthest to the nearest: the last one stays.
-    contested = (np.bincount(cell, minlength=x.size)[cell] > 1).nonzero()[0]
-    point = np.concatenate([part.point for part in parts], axis=1)[:, contested]
-    cell, tags = cell[contested], tags[contested]
+    contested = (np.bincount(cell, minlength=winner.size)[cell] > 1).nonzero()[0]
+    cell, thing, tags = cell[contested], thing[contested], tags[contested]
+    low, high = np.concatenate((FIXED_BOUNDS, bodies.bounds), axis=2)[:, :, thing]
+    point = np.minimum(np.maximum(middle.reshape(2, -1)[:, cell], low), high)
     agent = cell // CELLS**2
     away_x = point[0] - (view.x + CENTRE_AHEAD * view.sin)[agent]
     away_z = point[1] - (view.z + CENTRE_AHEAD * view.cos)[agent]
@@ -80,39 +98,27 @@ def look(
     return grid.astype(np.float32)
 
 
-def _walls(view: View, x: np.ndarray, z: np.ndarray) -> Painted:
-    """Paint the four walls: two of 26 m along z, two of 25 m along x between them."""
+def _walls(view: View, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cells with a wall, by their `middle` [2, n, 20, 20], and the number of the wall, int [K]."""
     reach = (CELL_HALF * (np.abs(view.sin) + np.abs(view.cos)))[:, None, None]
-    far_x, far_z = np.abs(x), np.abs(z)
-    farthest = np.maximum(far_x, far_z)
+    far = np.abs(middle)
+    farthest = np.maximum(far[0], far[1])
     touches = (farthest >= INNER - reach) & (farthest <= OUTER + reach) & _beside_corners(view)
     cell = np.flatnonzero(touches)
 
-    # The nearest point of that wall, of the two that may meet in a corner, in which the cell lies deeper.
-    x, z = x.ravel()[cell], z.ravel()[cell]
-    across = np.abs(x) > np.abs(z)
-    face = np.where(across, x, z)
-    on_face = np.copysign(np.clip(np.abs(face), INNER, OUTER), face)
-    along_x = np.clip(x, -INNER, INNER)
-    point = np.stack(
-        [np.where(across, on_face, along_x), np.where(across, np.clip(z, -OUTER, OUTER), on_face)]
-    )
-    return Painted(cell, np.full(cell.size, WALL), point)
+    # Of the two that may meet in a corner the one in which the cell lies deeper.
+    far, away = far.reshape(2, -1)[:, cell], middle.reshape(2, -1)[:, cell] > 0
+    across = far[0] > far[1]
+    return cell, np.where(across, away[0], 2 + away[1])
 
 
-def _goal(view: View, x: np.ndarray, z: np.ndarray) -> Painted:
-    """Paint the goal's strip."""
+def _goal(view: View, middle: np.ndarray) -> np.ndarray:
+    """Return the cells in which the goal's strip lies, by their `middle` [2, n, 20, 20]."""
     spread = np.abs(view.sin) + np.abs(view.cos)
     reach = (CELL_HALF * spread)[:, None, None]
+    x, z = middle
     touches = (z <= GOAL_HIGH + reach) & (z >= GOAL_LOW - reach) & (np.abs(x) <= GOAL_HALF_X + reach)
-    cell = np.flatnonzero(touches)
-    point = np.stack(
-        [
-            np.clip(x.ravel()[cell], -GOAL_HALF_X, GOAL_HALF_X),
-            np.clip(z.ravel()[cell], GOAL_LOW, GOAL_HIGH),
-        ]
-    )
-    return Painted(cell, np.full(cell.size, GOAL), point)
+    return np.flatnonzero(touches)
 
 
 def _beside_corners(view: View) -> np.ndarray:
@@ -127,16 +133,9 @@ def _beside_corners(view: View) -> np.ndarray:
 
 
 def _bodies(
-    view: View,
-    x: np.ndarray,
-    z: np.ndarray,
-    place: np.ndarray,
-    yaw: np.ndarray,
-    half: np.ndarray,
-    tag: np.ndarray,
-    seen: np.ndarray,
-) -> Painted:
-    """Paint boxes that are turned about the vertical."""
+    view: View, place: np.ndarray, yaw: np.ndarray, half: np.ndarray, tag: np.ndarray, seen: np.ndarray
+) -> Bodies:
+    """Find the boxes in the grids, turned about the vertical, and their cells."""
     sin, cos = view.sin[:, None], view.cos[:, None]
     offset_x, offset_z = place[..., 0] - view.x[:, None], place[..., 1] - view.z[:, None]
     right, ahead = offset_x * cos - offset_z * sin, offset_x * sin + offset_z * cos
@@ -166,21 +165,6 @@ def _bodies(
 
     pair, i, j = inside.nonzero()
     cell = (agent[pair] * CELLS + h[pair, i]) * CELLS + w[pair, j]
-    return Painted(cell, tag[body[pair]], _bounds_point(seen, place, yaw, half, pair, (x, z), cell))
-
-
-def _bounds_point(
-    seen: np.ndarray,
-    place: np.ndarray,
-    yaw: np.ndarray,
-    half: np.ndarray,
-    pair: np.ndarray,
-    middles: tuple[np.ndarray, np.ndarray],
-    cell: np.ndarray,
-) -> np.ndarray:
-    """Return the points [2, K] of the bodies' bounding boxes that are nearest to the cells' middles."""
-    s, c = np.abs(np.sin(yaw[seen])), np.abs(np.cos(yaw[seen]))
-    extent = np.stack([half[:, 0] * c + half[:, 1] * s, half[:, 0] * s + half[:, 1] * c])[:, pair]
-    centre = place[seen].T[:, pair]
-    middle = np.stack([part.ravel()[cell] for part in middles])
-    return np.asarray(np.clip(middle, centre - extent, centre + extent))
+    extent = plan_extents(turns_of(yaw[seen]), half)
+    centre = place[seen]
+    return Bodies(cell, pair, tag[body], np.array((centre - extent, centre + extent)).swapaxes(1, 2))
