@@ -24,11 +24,11 @@ NUM_TAGS = 6
 NOTHING = -1
 INNER, OUTER = 12.5, 13.0  # m: faces of the walls
 GOAL_LOW, GOAL_HIGH, GOAL_HALF_X = -12.65, -8.35, 12.5  # m: z, z, x
-GOAL_NUMBER = 4  # after the walls
-FIXED_TAGS = np.array([WALL] * 4 + [GOAL], np.int8)
+_GOAL = 4  # after the walls on the left, right, behind and ahead
+_FIXED_TAGS = np.array([WALL] * 4 + [GOAL], np.int8)
 _LOW = (-OUTER, -OUTER), (INNER, -OUTER), (-INNER, -OUTER), (-INNER, INNER), (-GOAL_HALF_X, GOAL_LOW)
 _HIGH = (-INNER, OUTER), (OUTER, OUTER), (INNER, -INNER), (INNER, OUTER), (GOAL_HALF_X, GOAL_HIGH)
-FIXED_BOUNDS = np.array((_LOW, _HIGH)).swapaxes(1, 2)  # [2, 2, 5], m: low and high, x and z
+_FIXED_BOUNDS = np.array((_LOW, _HIGH)).swapaxes(1, 2)  # [2, 2, 5], m: low and high, x and z
 _EACH_TAG = np.arange(NUM_TAGS, dtype=np.int8)[:, None, None]
 _RIGHT = (CELLS - 1) / 2 - np.arange(CELLS)  # m, of h
 _AHEAD = np.arange(CELLS) + CELL_HALF  # m, of w
@@ -51,7 +51,7 @@ class Bodies(NamedTuple):
     cell: np.ndarray
     """int [K]: (agent * 20 + h) * 20 + w."""
     pair: np.ndarray
-    """int [K]: whose cell it is."""
+    """int [K]: the body, of P."""
     tag: np.ndarray
     """int8 [P]."""
     bounds: np.ndarray
@@ -72,21 +72,22 @@ def look(
         np.add(rows[:, :, None], (_AHEAD * ahead[:, None])[:, None], out=middle[part])
 
     # Things are numbered: the fixed ones, then the bodies.
-    wall_cell, wall = _walls(view, middle)
-    goal_cell = _goal(view, middle)
-    goal = np.full(goal_cell.size, GOAL_NUMBER)
+    spread = np.abs(view.sin) + np.abs(view.cos)  # half-width of a turned square of half-edge 1
+    wall_cell, wall = _walls(view, middle, spread)
+    goal_cell = _goal(middle, spread)
+    goal = np.full(goal_cell.size, _GOAL)
     bodies = _bodies(view, place, yaw, half, tag, seen)
 
     cell = np.concatenate((wall_cell, goal_cell, bodies.cell))
-    thing = np.concatenate((wall, goal, bodies.pair + len(FIXED_TAGS)))
-    tags = np.concatenate((FIXED_TAGS, bodies.tag))[thing]
+    thing = np.concatenate((wall, goal, bodies.pair + len(_FIXED_TAGS)))
+    tags = np.concatenate((_FIXED_TAGS, bodies.tag))[thing]
     winner = np.full(middle[0].size, NOTHING, np.int8)
     winner[cell] = tags
 
     # Where several things lie, written from the farthest to the nearest: the last one stays.
     contested = (np.bincount(cell, minlength=winner.size)[cell] > 1).nonzero()[0]
     cell, thing, tags = cell[contested], thing[contested], tags[contested]
-    low, high = np.concatenate((FIXED_BOUNDS, bodies.bounds), axis=2)[:, :, thing]
+    low, high = np.concatenate((_FIXED_BOUNDS, bodies.bounds), axis=2)[:, :, thing]
     point = np.minimum(np.maximum(middle.reshape(2, -1)[:, cell], low), high)
     agent = cell // CELLS**2
     away_x = point[0] - (view.x + CENTRE_AHEAD * view.sin)[agent]
@@ -98,12 +99,12 @@ def look(
     return grid.astype(np.float32)
 
 
-def _walls(view: View, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _walls(view: View, middle: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the cells with a wall, by their `middle` [2, n, 20, 20], and the number of the wall, int [K]."""
-    reach = (CELL_HALF * (np.abs(view.sin) + np.abs(view.cos)))[:, None, None]
+    reach = (CELL_HALF * spread)[:, None, None]
     far = np.abs(middle)
     farthest = np.maximum(far[0], far[1])
-    touches = (farthest >= INNER - reach) & (farthest <= OUTER + reach) & _beside_corners(view)
+    touches = (farthest >= INNER - reach) & (farthest <= OUTER + reach) & _beside_corners(view, spread)
     cell = np.flatnonzero(touches)
 
     # Of the two that may meet in a corner the one in which the cell lies deeper.
@@ -112,21 +113,20 @@ def _walls(view: View, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return cell, np.where(across, away[0], 2 + away[1])
 
 
-def _goal(view: View, middle: np.ndarray) -> np.ndarray:
+def _goal(middle: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Return the cells in which the goal's strip lies, by their `middle` [2, n, 20, 20]."""
-    spread = np.abs(view.sin) + np.abs(view.cos)
     reach = (CELL_HALF * spread)[:, None, None]
     x, z = middle
     touches = (z <= GOAL_HIGH + reach) & (z >= GOAL_LOW - reach) & (np.abs(x) <= GOAL_HALF_X + reach)
     return np.flatnonzero(touches)
 
 
-def _beside_corners(view: View) -> np.ndarray:
+def _beside_corners(view: View, spread: np.ndarray) -> np.ndarray:
     """Return bool [n, 20, 20]: which cells a square of half-width 13 m around the area's middle overlaps.
 
     By the cells' own axes; by the area's axes their distance says it.
     """
-    reach = (OUTER * (np.abs(view.sin) + np.abs(view.cos)))[:, None] + CELL_HALF
+    reach = (OUTER * spread)[:, None] + CELL_HALF
     right = _RIGHT + (view.x * view.cos - view.z * view.sin)[:, None]
     ahead = _AHEAD + (view.x * view.sin + view.z * view.cos)[:, None]
     return np.asarray((np.abs(right) <= reach)[:, :, None] & (np.abs(ahead) <= reach)[:, None])
@@ -143,7 +143,8 @@ def _bodies(
     seen = seen & (np.abs(right) <= _RIGHT[0] + radius) & (ahead >= -radius) & (ahead <= CELLS + radius)
     agent, body = seen.nonzero()
     right, ahead, radius, half = right[seen], ahead[seen], radius[seen], half[seen]
-    turn = yaw[seen] - np.arctan2(view.sin, view.cos)[agent]
+    turn = turns_of(yaw[seen])
+    turn_in_grid = turn * (view.cos + 1j * view.sin)[agent]
 
     # Only the cells around a body are looked at: h falls to the right.
     window = np.arange(int(2 * radius.max(initial=0.0)) + 1)
@@ -153,18 +154,16 @@ def _bodies(
     before = (w + CELL_HALF - ahead[:, None])[:, None]
 
     # Separating axes of two rectangles: the cell's two, then the body's two.
-    s, c = np.sin(turn)[:, None, None], np.cos(turn)[:, None, None]
+    s, c = -turn_in_grid.imag[:, None, None], turn_in_grid.real[:, None, None]
     half_x, half_z = half[:, 0, None, None], half[:, 1, None, None]
     spread = CELL_HALF * (np.abs(s) + np.abs(c))
-    inside = (np.abs(beside) <= CELL_HALF + half_x * np.abs(c) + half_z * np.abs(s)) & (
-        np.abs(before) <= CELL_HALF + half_x * np.abs(s) + half_z * np.abs(c)
-    )
+    reach_right, reach_ahead = CELL_HALF + plan_extents(turn_in_grid, half).T[:, :, None, None]
+    inside = (np.abs(beside) <= reach_right) & (np.abs(before) <= reach_ahead)
     inside &= np.abs(beside * c - before * s) <= half_x + spread
     inside &= np.abs(beside * s + before * c) <= half_z + spread
     inside &= ((h >= 0) & (h < CELLS))[:, :, None] & ((w >= 0) & (w < CELLS))[:, None]
 
     pair, i, j = inside.nonzero()
     cell = (agent[pair] * CELLS + h[pair, i]) * CELLS + w[pair, j]
-    extent = plan_extents(turns_of(yaw[seen]), half)
-    centre = place[seen]
+    centre, extent = place[seen], plan_extents(turn, half)
     return Bodies(cell, pair, tag[body], np.array((centre - extent, centre + extent)).swapaxes(1, 2))
