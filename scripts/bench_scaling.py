@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """Measure training with workers: decisions a second for 0, 1 and 2 of them, with overlap and without,
-and with two learners.
+and with two learners. A machine of many cores has use for more: `--workers 1 2 4 8 --learners 2 4`.
 
 Every variant trains the scene's preset for some iterations; they take turns, so that the ratios hold on a
 machine that is shared. What is timed is the whole loop: collecting, learning, metrics, the state that a
@@ -29,15 +29,6 @@ from mappo_unity.training.run_state import RunState
 from mappo_unity.training.trainer import train
 
 WARM_UP = 2  # iterations that are not timed
-VARIANTS = (
-    ("0", []),
-    ("1", ["collect.workers=1"]),
-    ("2", ["collect.workers=2"]),
-    ("1, overlap", ["collect.workers=1", "collect.overlap=true"]),
-    ("2, overlap", ["collect.workers=2", "collect.overlap=true"]),
-    ("0, 2 learners", ["learners=2", "update_threads=1"]),
-    ("2, 2 learners", ["collect.workers=2", "learners=2", "update_threads=1"]),
-)
 QUIET = ["log.loggers=[]", "log.progress=false", "export_onnx=false"]
 QUIET += ["self_play.save_steps=null"]  # a pool costs by its own: scripts/bench_self_play.py
 ENDLESS = ["max_steps=1000000000", "checkpoint_interval=1000000000", "matches.interval=null"]
@@ -51,15 +42,19 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=["3DBall", "SoccerTwos"])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--iterations", type=int, default=6, help="timed ones of each repeat")
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--learners", type=int, nargs="+", default=[2])
     parser.add_argument("--engine", choices=["processes", "ray"], default="processes", help="of workers")
     parser.add_argument("--option", action="append", default=[], help="a further option of every run")
     arguments = parser.parse_args()
 
+    variants = variants_of(arguments.workers, arguments.learners)
+
     print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores")
     for scene in arguments.scenes:
-        rates: dict[str, list[float]] = {name: [] for name, _ in VARIANTS}
+        rates: dict[str, list[float]] = {name: [] for name in variants}
         for _ in range(arguments.repeats):
-            for name, lines in VARIANTS:
+            for name, lines in variants.items():
                 options = [f"env={scene}", *QUIET, *ENDLESS, *arguments.option, *lines]
                 has_workers = any(line.startswith("collect.workers") for line in lines)
                 options += [f"collect.engine={arguments.engine}"] if has_workers else []
@@ -67,6 +62,19 @@ def main() -> None:
                     rates[name].append(measure(options, arguments.iterations))
         print_table(scene, rates)
     print(f"load average {os.getloadavg()[0]:.2f}")
+
+
+def variants_of(workers: list[int], learners: list[int]) -> dict[str, list[str]]:
+    """Return the options of each variant by its name, the plain run first."""
+    variants: dict[str, list[str]] = {"0": []}
+    for overlap in ([], ["collect.overlap=true"]):
+        for count in workers:
+            variants[f"{count}{', overlap' if overlap else ''}"] = [f"collect.workers={count}", *overlap]
+    for learning in learners:
+        side_by_side = [f"learners={learning}", "update_threads=1"]
+        variants[f"0, {learning} learners"] = side_by_side
+        variants[f"{learning}, {learning} learners"] = [f"collect.workers={learning}", *side_by_side]
+    return variants
 
 
 def measure(options: list[str], iterations: int) -> float:

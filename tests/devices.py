@@ -54,6 +54,9 @@ def simulated_device() -> Iterator[None]:
         "device_count": lambda: 1,
         "current_device": lambda: 0,
         "synchronize": lambda device=None: None,
+        "is_current_stream_capturing": lambda: (
+            False
+        ),  # a build with CUDA asks the driver, which may be missing
         "Event": MagicMock(),
         "cudart": MagicMock(),
         "manual_seed_all": lambda seed: state.fill_(seed % 251),
@@ -61,7 +64,9 @@ def simulated_device() -> Iterator[None]:
         "get_rng_state_all": lambda: [state.clone()],
         "set_rng_state": lambda given, device=None: state.copy_(given),
     }
-    with patch.multiple(torch.cuda, **known), _Kernels(), _Calls():
+    # memories do not ask cuDNN, whose kernels are not the CPU's
+    no_cudnn = patch.object(torch.backends.cudnn, "is_acceptable", lambda tensor: False)
+    with patch.multiple(torch.cuda, **known), no_cudnn, _Kernels(), _Calls():
         yield
 
 
