@@ -76,7 +76,9 @@ def measure(options: list[str], iterations: int) -> tuple[float, float, float]:
 
     with tempfile.TemporaryDirectory() as folder:
         cfg = compose_config([*options, *QUIET, *ENDLESS]).config
-        train(cfg, Path(folder), None, stop, Console(file=io.StringIO()))
+        outcome = train(cfg, Path(folder), None, stop, Console(file=io.StringIO()))
+        if outcome.signal is not None:
+            raise SystemExit(128 + outcome.signal)  # somebody ends the measurement, not this run alone
         with (Path(folder) / "metrics.csv").open() as file:
             rows = list(csv.DictReader(file))[WARM_UP:]
     names = ("collect_s", "update_s", "steps_per_s")
