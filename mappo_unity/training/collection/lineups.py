@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mappo_unity.keys import LEARNER
 from mappo_unity.learning.networks.actor_critic import UnityActor
@@ -169,4 +169,8 @@ def make_player(learner: UnityActor, network: Network) -> Player:
     actor = copy.deepcopy(learner)
     actor.keeps_components = False
     actor.load_state_dict(network)
+    for module in actor.modules():
+        if isinstance(module, nn.RNNBase):
+            # a copy's weights lie apart in memory, where cuDNN would gather them in every call
+            module.flatten_parameters()
     return actor.eval()
