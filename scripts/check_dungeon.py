@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.scenes.core.ground import TICK_S
@@ -68,6 +69,7 @@ def main() -> None:
     parser.add_argument("--num-areas", type=int, default=64)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    torch.manual_seed(options.seed)  # a checkpoint's policy draws from it
     env = CountingDungeon(num_areas=options.num_areas, seed=options.seed)
     policy = open_policy(options.policy, deterministic=False, seed=options.seed, option="policy")
     env.reset()

@@ -12,6 +12,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import torch
+
 from mappo_unity.policies.matches import find_sides, play_side
 from mappo_unity.policies.policy import CheckpointPolicy, Policy
 from mappo_unity.scenes.registry import make_scene
@@ -40,6 +42,7 @@ def main() -> None:
 
 def play(strikers: Policy, goalie: Policy, matches: int, seed: int) -> tuple[float, float]:
     """Return the share of the matches in which the strikers scored, and the mean decisions of a match."""
+    torch.manual_seed(seed)  # the policies draw from it
     env = make_scene("StrikersVsGoalie", seed=seed)
     try:
         sides = find_sides(env)
