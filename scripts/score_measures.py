@@ -21,7 +21,7 @@ class Measure:
         figure: value and standard error from the JSON line of mappo-eval.
         target: what the preset should reach.
         column: of metrics.csv, whose curve shows how training came there.
-        opponent: None, "random" or "unity".
+        opponent: None, "random", "unity", or "own": the same policy plays the other side, too.
         is_lower_better: for times.
         episodes: or matches, that the figure is of.
     """
@@ -103,6 +103,12 @@ MEASURES = (
         column="Striker?team=0/match_decisions_vs_random",
         opponent="random",
         is_lower_better=True,
+    ),
+    Measure(
+        *("StrikersVsGoalie", "decisions to a goal, own goalie", decisions_to_goal, 100.0),
+        column="Striker?team=0/match_decisions_vs_random",
+        opponent="own",
+        episodes=800,
     ),
 )
 

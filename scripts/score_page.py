@@ -115,7 +115,7 @@ def reached_after(measure: Measure) -> str:
 
 def first_reached(measure: Measure) -> list[Point]:
     """Return where the curve of each seed stood at the target first, of the seeds that did."""
-    if measure.opponent == "unity":  # no run plays against it while it learns
+    if measure.opponent in ("unity", "own"):  # no run plays these matches while it learns
         return []
 
     curves = curves_of(measure.scene, measure.column).values()
@@ -142,7 +142,8 @@ def summary_row(measure: Measure, rows: list[dict[str, str]]) -> str:
     sampled = [row for row in rows if row["sampled"] == "True"]
     seeds = [float(row["value"]) for row in sampled if is_tuned_on(row)]
     values = {row["policy"]: float(row["value"]) for row in sampled}
-    ours = f"**{amount(statistics.mean(seeds))}**" + (f" (of {len(seeds)})" if len(seeds) < 3 else "")
+    ours = f"**{amount(statistics.mean(seeds))}**" if seeds else "-"
+    ours += f" (of {len(seeds)})" if 0 < len(seeds) < 3 else ""
     random, unity = (amount(values[player]) if player in values else "-" for player in FIXED)
 
     # the seed in the middle, of those that came there

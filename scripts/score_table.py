@@ -183,10 +183,12 @@ def evaluate(
         if arguments.unity is None or player == "unity":
             return None
         lines.append(f"opponent={arguments.unity.resolve()}")
+    elif measure.opponent == "own":
+        lines.append(policy[0].replace("run=", "opponent=", 1))
     elif measure.opponent is not None:
         lines.append(f"opponent={measure.opponent}")
 
-    if player == "random" and (deterministic or measure.opponent == "unity"):
+    if player == "random" and (deterministic or measure.opponent in ("unity", "own")):
         return None
     try:
         return mappo_eval(*lines, timeout_s=EVALUATION_S)

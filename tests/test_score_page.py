@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import sys
 from pathlib import Path
@@ -79,6 +80,19 @@ def test_a_row_says_how_many_seeds_there_are(curves: None) -> None:
     cells = score_page.summary_row(Measure("Probe", "return", mean_return, 0.5), rows).split(" | ")
     assert cells[1:-1] == ["return", "-1", "**0.6** (of 2)", "-", ">= 0.5"]
     assert cells[-1].startswith("0.00 M decisions, 1.0 min (1 of 2 seeds)")
+    alone = score_page.summary_row(Measure("Probe", "return", mean_return, 0.5), [row("3", 1.0)])
+    assert alone.split(" | ")[2:5] == ["-", "-", "-"]
+
+
+def test_own_matches_are_played_by_one_policy_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(score_table, "mappo_eval", lambda *lines, timeout_s: asked.extend(lines) or {})
+    own = next(measure for measure in MEASURES if measure.opponent == "own")
+
+    arguments = argparse.Namespace(episodes=None, unity=None)
+    assert score_table.evaluate(arguments, own, "0", ["run=some/run"], False) == {}
+    assert {"run=some/run", "opponent=some/run"} <= set(asked)
+    assert score_table.evaluate(arguments, own, "random", ["run=random"], False) is None
 
 
 def note_options(folder: Path, *options: str) -> None:
