@@ -11,7 +11,6 @@ on the CPU whatever the device, so `collect` holds the copies to the GPU and bac
 from __future__ import annotations
 
 import argparse
-import csv
 import io
 import os
 import shlex
@@ -20,14 +19,15 @@ import tempfile
 from pathlib import Path
 
 import torch
+from bench_scaling import ENDLESS, WARM_UP
 from rich.console import Console
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.runs.metrics_csv import read_metrics
 from mappo_unity.training.outcome import INTERRUPTED
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.trainer import train
 
-WARM_UP = 2  # iterations that are not counted: kernels load, memory is taken
 CASES = (
     "env=3DBall",
     "env=SoccerTwos",
@@ -39,7 +39,6 @@ CASES = (
     "env=GridFoodCollector model.image_encoder=resnet",
 )
 QUIET = ("log.loggers=[csv]", "log.progress=false", "export_onnx=false", "self_play.save_steps=null")
-ENDLESS = ("max_steps=1000000000", "checkpoint_interval=1000000000", "matches.interval=null")
 
 
 def main() -> None:
@@ -79,10 +78,9 @@ def measure(options: list[str], iterations: int) -> tuple[float, float, float]:
         outcome = train(cfg, Path(folder), None, stop, Console(file=io.StringIO()))
         if outcome.signal is not None:
             raise SystemExit(128 + outcome.signal)  # somebody ends the measurement, not this run alone
-        with (Path(folder) / "metrics.csv").open() as file:
-            rows = list(csv.DictReader(file))[WARM_UP:]
+        rows = read_metrics(Path(folder) / "metrics.csv")[WARM_UP:]
     names = ("collect_s", "update_s", "steps_per_s")
-    collect_s, update_s, rate = (statistics.median(float(row[name]) for row in rows) for name in names)
+    collect_s, update_s, rate = (statistics.median(row[name] for row in rows) for name in names)
     return collect_s, update_s, rate
 
 

@@ -54,9 +54,8 @@ def simulated_device() -> Iterator[None]:
         "device_count": lambda: 1,
         "current_device": lambda: 0,
         "synchronize": lambda device=None: None,
-        "is_current_stream_capturing": lambda: (
-            False
-        ),  # a build with CUDA asks the driver, which may be missing
+        # a build with CUDA asks the driver, which may be missing
+        "is_current_stream_capturing": lambda: False,
         "Event": MagicMock(),
         "cudart": MagicMock(),
         "manual_seed_all": lambda seed: state.fill_(seed % 251),
