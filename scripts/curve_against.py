@@ -14,6 +14,7 @@ import csv
 import time
 from pathlib import Path
 
+import torch
 from learn_scene import append
 
 from mappo_unity.envs.backends import make_env_function
@@ -54,9 +55,11 @@ def point(arguments: argparse.Namespace, run: Path, path: Path) -> None:
                 return
 
     make_env = make_env_function(config_to_play(run, None).env)
+    seed = steps % 2**31
+    torch.manual_seed(seed)  # a checkpoint's policy draws from it
     policy = CheckpointPolicy(path, deterministic=False)
-    opponent = open_policy(arguments.opponent, deterministic=False, seed=steps % 2**31)
-    scores = play_matches(make_env, policy, opponent, arguments.matches, seed=steps % 2**31)
+    opponent = open_policy(arguments.opponent, deterministic=False, seed=seed)
+    scores = play_matches(make_env, policy, opponent, arguments.matches, seed=seed)
     total = sum(scores.values(), Score())
 
     figures = total.figures()
