@@ -23,6 +23,7 @@ from bench_scaling import ENDLESS, WARM_UP
 from rich.console import Console
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.metrics_csv import read_metrics
 from mappo_unity.training.outcome import INTERRUPTED
 from mappo_unity.training.run_state import RunState
@@ -59,9 +60,11 @@ def main() -> None:
         print(f"\n{case}\n{'':32}{'collect':>10}{'learn':>10}{'decisions/s':>14}{'learns':>9}")
         first = None
         for device in arguments.devices:
-            collect_s, update_s, rate = measure(
-                [*shlex.split(case), *shlex.split(device)], arguments.iterations
-            )
+            options = [*shlex.split(case), *shlex.split(device)]
+            try:
+                collect_s, update_s, rate = measure(options, arguments.iterations)
+            except ConfigError as mistake:  # no GPU here, for example
+                parser.error(str(mistake))
             first = first or update_s
             faster = f"{first / update_s:8.2f}x"
             print(f"{device:32}{collect_s:8.2f} s{update_s:8.2f} s{rate:14,.0f}{faster}", flush=True)

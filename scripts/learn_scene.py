@@ -22,6 +22,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from mappo_unity.runs.checkpoint_file import checkpoints_in
+
 Point = TypeVar("Point")
 
 HERE = Path(sys.executable).parent
@@ -59,7 +61,7 @@ def train(scene: str, seed: int, folder: Path, options: list[str]) -> None:
 
 def evaluate(scene: str, seed: int, folder: Path, episodes: int) -> list[dict[str, object]]:
     """Evaluate the newest checkpoint, as it explores; return a row of results for each behavior."""
-    newest = sorted((folder / "checkpoints").glob("step_*.pt"))[-1]
+    newest = checkpoints_in(folder)[-1]
     result = mappo_eval(f"run={newest}", f"episodes={episodes}")
     behaviors = result.get("behaviors") or {scene: result}
 

@@ -123,6 +123,7 @@ def player_of(pid: int) -> int | None:
 def report(run: Path, code: int, troubles: int) -> int:
     """Print how it ended; return the exit code."""
     from mappo_unity.policies.evaluate import evaluate
+    from mappo_unity.runs.checkpoint_file import checkpoints_in
 
     with (run / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -131,7 +132,7 @@ def report(run: Path, code: int, troubles: int) -> int:
         print(f"{name}: {float(last[name]):,.1f}")
     for name in ("restarts", "dropped_episodes", "dropped_steps"):
         print(f"{name}: {float(last[name]):,.0f}")
-    final = max((run / "checkpoints").glob("step_*.pt"))
+    final = checkpoints_in(run)[-1]
     earned = evaluate(final, episodes=100)["mean_return"] if code == 0 else float("nan")
     solved = earned >= 95
     counted = int(float(last["restarts"])) == troubles
