@@ -5,7 +5,7 @@
 
 Checked: no NaN or infinity in any observation or reward; no warning from MuJoCo (unstable simulation) and no
 invalid floating-point operation in numpy; resident memory grows by less than 2% after a warm-up of a quarter
-of the time; every reset lies in its stated range; bodies stay within the walls (`scene_ranges.py`).
+of the time; every reset lies in its stated range; bodies stay within the walls (`scene_ranges`).
 Play changes between fresh random actions and random actions that are held for ten decisions on average,
 which take agents farther, every simulated minute.
 
@@ -32,7 +32,7 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps  # noqa: E402
-from scene_ranges import Seen  # noqa: E402
+from scene_ranges.ranges import Seen  # noqa: E402
 
 from mappo_unity.scenes import make_scene  # noqa: E402
 from mappo_unity.scenes.contract.play import random_actions  # noqa: E402

@@ -47,7 +47,11 @@ def _ours(name: str, folder: str, scene: str, picture: tuple[int, int]) -> Scene
     """Return the record of a scene of this package, whose parts lie alike for every scene."""
     package = f"{__package__}.{folder}"
     return SceneRecord(
-        name, f"{package}.scene:{scene}", f"{package}.drawing:DRAWING", f"scene_ranges:{scene}", picture
+        name,
+        f"{package}.scene:{scene}",
+        f"{package}.drawing:DRAWING",
+        f"scene_ranges.{folder}:{scene}",
+        picture,
     )
 
 
