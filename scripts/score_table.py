@@ -180,7 +180,10 @@ def evaluate(
     episodes = arguments.episodes or measure.episodes
     lines = [*policy, f"episodes={episodes}", f"deterministic={str(deterministic).lower()}"]
     if measure.opponent == "unity":
-        if arguments.unity is None or player == "unity":
+        if player == "unity":
+            return None
+        if arguments.unity is None:
+            print(f"{measure.scene}, {player}: not measured against Unity's policy, for want of --unity")
             return None
         lines.append(f"opponent={arguments.unity.resolve()}")
     elif measure.opponent == "own":
