@@ -23,7 +23,8 @@ SIZES = ((384, 6), (320, 6), (272, 6), (240, 6), (208, 6), (240, 4))
 """Widths, in the shape of docs/scenes/NAME.png, and seconds."""
 LARGEST = 850_000  # bytes
 SEEDS = {"CooperativePushBlock": 10, "DungeonEscape": 3, "Pyramids": 45, "SoccerTwos": 9}
-"""1 for all others. Agents push a very large block home; two groups escape; an episode ends; two goals."""
+"""Of the scenes, 1 for all others. In their order: three agents push a very large block home, two groups
+escape, an episode ends, two goals are scored."""
 PLACE = Path(__file__).resolve().parents[1] / "docs/scenes"
 
 
