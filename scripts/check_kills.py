@@ -11,7 +11,6 @@ must add up, no process may be left, and the best policy is evaluated.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import random
 import signal
@@ -23,6 +22,7 @@ from learn_scene import mappo_eval
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.runs.folder import write_record
+from mappo_unity.runs.metrics_csv import read_metrics
 from mappo_unity.training.collection.processes import RemoteWorkers
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.trainer import train
@@ -55,11 +55,10 @@ def main() -> None:
         write_record(Path(folder), cfg, lines)  # which mappo-eval reads
         outcome = train(cfg, Path(folder), after_iteration=killer.watch)
         killer.end()
-        with open(Path(folder) / "metrics.csv", newline="") as file:
-            rows = list(csv.DictReader(file))
+        last = read_metrics(Path(folder) / "metrics.csv")[-1]
         said = mappo_eval(f"run={folder}", "deterministic=true")
 
-    counted = int(float(rows[-1]["restarts"]))
+    counted = int(last["restarts"])
     left = [pid for pid in killer.seen if is_alive(pid)]
     print(
         f"{len(killer.killed)} workers killed, {counted} replaced, {len(left)} processes left of "

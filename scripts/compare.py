@@ -11,7 +11,6 @@ matches against a random side are played before and after.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import statistics
 import tempfile
@@ -23,6 +22,7 @@ from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.evaluate import match_figures
 from mappo_unity.policies.matches import play_matches
 from mappo_unity.policies.policy import ActorPolicy, RandomPolicy
+from mappo_unity.runs.metrics_csv import read_metrics
 from mappo_unity.training.resume_check import describe_policies
 from mappo_unity.training.run_state import RunState
 from mappo_unity.training.setup import TrainingSetup, set_up
@@ -74,11 +74,10 @@ def run(arguments: argparse.Namespace, variant: str, seed: int) -> str:
 
         outcome = train(cfg, Path(folder), after_iteration=watch)
         matches = f"{before} -> {after}" if arguments.matches else "-"
-        with open(Path(folder) / "metrics.csv", newline="") as file:
-            rows = list(csv.DictReader(file))
-    reached = next((row for row in rows if float(row["return_mean"]) >= arguments.goal), None)
-    first = f"{int(reached['agent_steps']):,} ({float(reached['wall_s']):.0f} s)" if reached else "-"
-    variances = [float(row["explained_variance"]) for row in rows[len(rows) // 2 :]]
+        rows = read_metrics(Path(folder) / "metrics.csv")
+    reached = next((row for row in rows if row["return_mean"] >= arguments.goal), None)
+    first = f"{reached['agent_steps']:,} ({reached['wall_s']:.0f} s)" if reached else "-"
+    variances = [row["explained_variance"] for row in rows[len(rows) // 2 :]]
     return (
         f"| {variant} | {seed} | {outcome.agent_steps:,} | {outcome.wall_s:.0f} | "
         f"{outcome.agent_steps / outcome.wall_s:,.0f} | {outcome.return_mean:.2f} | {first} | "

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mappo_unity.runs.checkpoint_file import checkpoints_in
+from mappo_unity.runs.metrics_csv import read_metrics
 
 Point = TypeVar("Point")
 
@@ -65,8 +66,7 @@ def evaluate(scene: str, seed: int, folder: Path, episodes: int) -> list[dict[st
     result = mappo_eval(f"run={newest}", f"episodes={episodes}")
     behaviors = result.get("behaviors") or {scene: result}
 
-    with open(folder / "metrics.csv") as file:
-        seconds = float(list(csv.DictReader(file))[-1]["wall_s"])
+    seconds = read_metrics(folder / "metrics.csv")[-1]["wall_s"]
     return [
         {
             "date": time.strftime("%Y-%m-%d"),

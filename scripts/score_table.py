@@ -177,13 +177,16 @@ def evaluate(
     arguments: argparse.Namespace, measure: Measure, player: str, policy: list[str], deterministic: bool
 ) -> dict[str, Any] | None:
     """Return what mappo-eval says of a policy; None where it cannot be measured."""
+    if player == "unity" and measure.opponent == "unity":
+        return None
+    if player == "random" and (deterministic or measure.opponent in ("unity", "own")):
+        return None
+
     episodes = arguments.episodes or measure.episodes
     lines = [*policy, f"episodes={episodes}", f"deterministic={str(deterministic).lower()}"]
     if measure.opponent == "unity":
-        if player == "unity":
-            return None
         if arguments.unity is None:
-            print(f"{measure.scene}, {player}: not measured against Unity's policy, for want of --unity")
+            print(f"{measure.scene}, {player}: not against Unity's policy, for want of --unity", flush=True)
             return None
         lines.append(f"opponent={arguments.unity.resolve()}")
     elif measure.opponent == "own":
@@ -191,8 +194,6 @@ def evaluate(
     elif measure.opponent is not None:
         lines.append(f"opponent={measure.opponent}")
 
-    if player == "random" and (deterministic or measure.opponent in ("unity", "own")):
-        return None
     try:
         return mappo_eval(*lines, timeout_s=EVALUATION_S)
     except subprocess.TimeoutExpired:

@@ -15,7 +15,6 @@ judged after a second half without troubles.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import random
 import shlex
@@ -124,19 +123,18 @@ def report(run: Path, code: int, troubles: int) -> int:
     """Print how it ended; return the exit code."""
     from mappo_unity.policies.evaluate import evaluate
     from mappo_unity.runs.checkpoint_file import checkpoints_in
+    from mappo_unity.runs.metrics_csv import read_metrics
 
-    with (run / "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    last = rows[-1]
+    last = read_metrics(run / "metrics.csv")[-1]
     for name in ("agent_steps", "return_mean", "episode_length_mean", "episodes"):
-        print(f"{name}: {float(last[name]):,.1f}")
+        print(f"{name}: {last[name]:,.1f}")
     for name in ("restarts", "dropped_episodes", "dropped_steps"):
-        print(f"{name}: {float(last[name]):,.0f}")
+        print(f"{name}: {last[name]:,.0f}")
     final = checkpoints_in(run)[-1]
     earned = evaluate(final, episodes=100)["mean_return"] if code == 0 else float("nan")
     solved = earned >= 95
-    counted = int(float(last["restarts"])) == troubles
-    print(f"exit code {code}; {troubles} troubles, {float(last['restarts']):.0f} restarts")
+    counted = int(last["restarts"]) == troubles
+    print(f"exit code {code}; {troubles} troubles, {last['restarts']:.0f} restarts")
     print(f"{final.name}, 100 episodes: mean return {earned:.2f}: {'solved' if solved else 'NOT solved'}")
     return 0 if solved and counted else 1
 
