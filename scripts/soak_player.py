@@ -141,6 +141,7 @@ def report(run: Path, code: int, troubles: int) -> int:
 
 def serve(arguments: list[str]) -> int:
     """Serve 3DBall as a player that goes wrong on signals."""
+    from mappo_unity.cli import player_main
     from mappo_unity.protocol import serve as player
 
     wrong: set[str] = set()
@@ -158,7 +159,7 @@ def serve(arguments: list[str]) -> int:
     signal.signal(signal.SIGUSR1, lambda *_: wrong.add("malformed"))
     signal.signal(signal.SIGUSR2, lambda *_: wrong.add("nan"))
     player.Player = Faulty  # type: ignore[misc]
-    return player.main(["3DBall", *arguments])
+    return player_main(["3DBall", *arguments])
 
 
 if __name__ == "__main__":
