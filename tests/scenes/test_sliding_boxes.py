@@ -26,8 +26,8 @@ def pushed(block: str, agents: int, ticks: int = 100, walls: float = 50.0) -> Sl
     )
     boxes.place[0, :agents, 0] = 1.02 * (np.arange(agents) - (agents - 1) / 2)
     boxes.place[0, :agents, 1] = -half - 0.5
-    drive = np.zeros((1, agents + 1, 2))
-    drive[0, :agents, 1] = 3.0
+    drive = np.zeros((1, agents + 1), complex)
+    drive[0, :agents] = 3j
     for _ in range(ticks):
         boxes.step(drive)
         assert boxes.deepest()[0] < 0.01
@@ -70,8 +70,8 @@ def test_a_push_off_the_middle_turns_a_block() -> None:
     """From the south at its east side: its east side goes north, that is, counterclockwise from above."""
     boxes = pushed("small", 1, ticks=0)
     boxes.place[0, 0, 0] = 0.85
-    drive = np.zeros((1, 2, 2))
-    drive[0, 0, 1] = 3.0
+    drive = np.zeros((1, 2), complex)
+    drive[0, 0] = 3j
     for _ in range(12):
         boxes.step(drive)
         assert boxes.deepest()[0] < 0.01
@@ -83,11 +83,11 @@ def test_a_spin_dies_on_the_floor() -> None:
     """Two anchors in opposite corners: 1.2 * m g r / I a second, r the half diagonal, I = m w^2 / 6."""
     boxes = pushed("large", 0, ticks=0)
     boxes.motion[0, 0, 2] = 5.0
-    boxes.step(np.zeros((1, 1, 2)))
+    boxes.step(np.zeros((1, 1), complex))
     loss = 1.2 * GRAVITY * 0.02 * 0.99 * np.sqrt(2.0) / (4.0 / 6.0)
     assert boxes.motion[0, 0, 2] == pytest.approx(5.0 * 0.999 - loss)
     for _ in range(10):
-        boxes.step(np.zeros((1, 1, 2)))
+        boxes.step(np.zeros((1, 1), complex))
     assert boxes.motion[0, 0, 2] == 0.0
 
 
@@ -105,8 +105,8 @@ def test_a_turned_block_is_pressed_flat_at_a_wall() -> None:
     boxes.place[0, :, 1] += 1.0
     boxes.yaw[0, 1] = 0.3
     boxes.place[0, 0, 1] -= 0.2
-    drive = np.zeros((1, 2, 2))
-    drive[0, 0, 1] = 3.0
+    drive = np.zeros((1, 2), complex)
+    drive[0, 0] = 3j
     for _ in range(100):
         boxes.step(drive)
         assert boxes.deepest()[0] < 0.02
@@ -116,8 +116,8 @@ def test_a_turned_block_is_pressed_flat_at_a_wall() -> None:
 def test_absent_bodies_are_not_met() -> None:
     boxes = pushed("very large", 1, ticks=0)
     boxes.present[0, 1] = False
-    drive = np.zeros((1, 2, 2))
-    drive[0, 0, 1] = 3.0
+    drive = np.zeros((1, 2), complex)
+    drive[0, 0] = 3j
     for _ in range(20):
         boxes.step(drive)
     assert boxes.place[0, 0, 1] > 2.0 and boxes.place[0, 1, 1] == 0.0

@@ -4,6 +4,7 @@ Cell (h, w) is a square of 1 m, turned with the agent, with its middle at right 
 the agent: the grid's centre is 10 m ahead. Of several things in a cell the one wins whose bounding box
 (along the area's axes), at its point nearest to the cell's middle, is nearest to the grid's centre. Heights
 do not matter: cells reach half a metre up and down from the agent's centre, and so meet everything.
+Vectors in the plane are complex numbers, as in `push_block/contacts.py`.
 Legend: n agents that look, M bodies of an area, P bodies in the grids of agents, K cells in
 which something lies.
 """
@@ -14,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mappo_unity.scenes.push_block.contacts import plan_extents, turns_of
+from mappo_unity.scenes.push_block.contacts import plan_extents
 
 CELLS = 20
 CELL_HALF = 0.5  # m
@@ -29,20 +30,19 @@ _FIXED_TAGS = np.array([WALL] * 4 + [GOAL], np.int8)
 _LOW = (-OUTER, -OUTER), (INNER, -OUTER), (-INNER, -OUTER), (-INNER, INNER), (-GOAL_HALF_X, GOAL_LOW)
 _HIGH = (-INNER, OUTER), (OUTER, OUTER), (INNER, -INNER), (INNER, OUTER), (GOAL_HALF_X, GOAL_HIGH)
 _FIXED_BOUNDS = np.array((_LOW, _HIGH)).swapaxes(1, 2)  # [2, 2, 5], m: low and high, x and z
-_EACH_TAG = np.arange(NUM_TAGS, dtype=np.int8)[:, None, None]
-_RIGHT = (CELLS - 1) / 2 - np.arange(CELLS)  # m, of h
-_AHEAD = np.arange(CELLS) + CELL_HALF  # m, of w
+_EACH_TAG = np.arange(NUM_TAGS, dtype=np.int8)[:, None]
+_CELL, _MIDDLE_CELL = np.arange(CELLS), (CELLS - 1) / 2
+_MIDDLES = np.array((_MIDDLE_CELL - _CELL, _CELL + CELL_HALF))  # m: to the right of h, ahead of w
+_MIDDLE = (_MIDDLES[0][:, None] + 1j * _MIDDLES[1]).ravel()  # of all cells, right + i ahead
 
 
 class View(NamedTuple):
-    """Where the agents that look are; arrays [n]."""
+    """Where the agents that look are; arrays complex [n]."""
 
-    x: np.ndarray
-    z: np.ndarray
-    """Place, m."""
-    sin: np.ndarray
-    cos: np.ndarray
-    """Of the yaw, clockwise from above."""
+    place: np.ndarray
+    """m, x + iz."""
+    turn: np.ndarray
+    """Their right."""
 
 
 class Bodies(NamedTuple):
@@ -50,8 +50,8 @@ class Bodies(NamedTuple):
 
     cell: np.ndarray
     """int [K]: (agent * 20 + h) * 20 + w."""
-    pair: np.ndarray
-    """int [K]: the body, of P."""
+    body: np.ndarray
+    """int [K]: which of P."""
     tag: np.ndarray
     """int8 [P]."""
     bounds: np.ndarray
@@ -59,111 +59,103 @@ class Bodies(NamedTuple):
 
 
 def look(
-    view: View, place: np.ndarray, yaw: np.ndarray, half: np.ndarray, tag: np.ndarray, seen: np.ndarray
+    view: View, place: np.ndarray, turn: np.ndarray, half: np.ndarray, tag: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
     """Return the grids, float32 [n, 6, 20, 20].
 
-    `place`, `half` [n, M, 2], `yaw` [n, M]: the bodies of each looking agent's area; `tag` int8 [M]; `seen`
-    bool [n, M]: False leaves a body out.
+    `place`, `turn`, `half` complex [n, M]: the bodies of each looking agent's area (x + iz; their right; half
+    sizes right + i forward); `tag` int8 [M]; `seen` bool [n, M]: False leaves a body out.
     """
-    middle = np.empty((2, len(view.x), CELLS, CELLS))
-    for part, start, right, ahead in ((0, view.x, view.cos, view.sin), (1, view.z, -view.sin, view.cos)):
-        rows = start[:, None] + _RIGHT * right[:, None]
-        np.add(rows[:, :, None], (_AHEAD * ahead[:, None])[:, None], out=middle[part])
+    middle = _MIDDLE * view.turn[:, None] + view.place[:, None]
 
     # Things are numbered: the fixed ones, then the bodies.
-    spread = np.abs(view.sin) + np.abs(view.cos)  # half-width of a turned square of half-edge 1
-    wall_cell, wall = _walls(view, middle, spread)
-    goal_cell = _goal(middle, spread)
+    wall_cell, wall, goal_cell = _fixed(view, middle)
     goal = np.full(goal_cell.size, _GOAL)
-    bodies = _bodies(view, place, yaw, half, tag, seen)
+    bodies = _bodies(view, place, turn, half, tag, seen)
 
     cell = np.concatenate((wall_cell, goal_cell, bodies.cell))
-    thing = np.concatenate((wall, goal, bodies.pair + len(_FIXED_TAGS)))
-    tags = np.concatenate((_FIXED_TAGS, bodies.tag))[thing]
-    winner = np.full(middle[0].size, NOTHING, np.int8)
+    thing = np.concatenate((wall, goal, bodies.body + len(_FIXED_TAGS)))
+    tags = np.concatenate((_FIXED_TAGS, bodies.tag)).take(thing)
+    winner = np.full(middle.size, NOTHING, np.int8)
     winner[cell] = tags
 
     # Where several things lie, written from the farthest to the nearest: the last one stays.
-    contested = (np.bincount(cell, minlength=winner.size)[cell] > 1).nonzero()[0]
-    cell, thing, tags = cell[contested], thing[contested], tags[contested]
-    low, high = np.concatenate((_FIXED_BOUNDS, bodies.bounds), axis=2)[:, :, thing]
-    point = np.minimum(np.maximum(middle.reshape(2, -1)[:, cell], low), high)
-    agent = cell // CELLS**2
-    away_x = point[0] - (view.x + CENTRE_AHEAD * view.sin)[agent]
-    away_z = point[1] - (view.z + CENTRE_AHEAD * view.cos)[agent]
+    contested = (np.bincount(cell, minlength=winner.size).take(cell) > 1).nonzero()[0]
+    cell, thing, tags = cell.take(contested), thing.take(contested), tags.take(contested)
+    low, high = np.concatenate((_FIXED_BOUNDS, bodies.bounds), axis=2).take(thing, axis=2)
+    at = middle.reshape(-1).take(cell)
+    x, z = np.minimum(np.maximum(np.array((at.real, at.imag)), low), high)
+    centre = (view.place + CENTRE_AHEAD * 1j * view.turn).take(cell // CELLS**2)
+    away_x, away_z = x - centre.real, z - centre.imag
     order = np.argsort(-(away_x * away_x + away_z * away_z), kind="stable")
-    winner[cell[order]] = tags[order]
+    winner[cell.take(order)] = tags.take(order)
 
-    grid = winner.reshape(-1, 1, CELLS, CELLS) == _EACH_TAG
-    return grid.astype(np.float32)
+    grid = winner.reshape(-1, 1, CELLS**2) == _EACH_TAG
+    return grid.astype(np.float32).reshape(-1, NUM_TAGS, CELLS, CELLS)
 
 
-def _walls(view: View, middle: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cells with a wall, by their `middle` [2, n, 20, 20], and the number of the wall, int [K]."""
-    reach = (CELL_HALF * spread)[:, None, None]
-    far = np.abs(middle)
-    farthest = np.maximum(far[0], far[1])
-    touches = (farthest >= INNER - reach) & (farthest <= OUTER + reach) & _beside_corners(view, spread)
-    cell = np.flatnonzero(touches)
+def _fixed(view: View, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the cells with a wall and the number of the wall, then the cells with the goal, int [K] each.
+
+    `middle` complex [n, 400]: the cells' middles, m.
+    """
+    spread = np.abs(view.turn.real) + np.abs(view.turn.imag)  # half-width of a turned square of half-edge 1
+    reach = (CELL_HALF * spread)[:, None]
+    far_x, far_z = np.abs(middle.real), np.abs(middle.imag)
+
+    # The walls make a frame around the room: by the area's axes, then by the cells' own.
+    farthest = np.maximum(far_x, far_z)
+    framed = np.abs(farthest - 0.5 * (INNER + OUTER)) <= reach + 0.5 * (OUTER - INNER)
+    along = (view.place * view.turn.conj()).view(float).reshape(-1, 2, 1)
+    beside = np.abs(_MIDDLES + along) <= (OUTER * spread + CELL_HALF)[:, None, None]
+    framed &= (beside[:, 0, :, None] & beside[:, 1, None]).reshape(framed.shape)
+    cell = framed.reshape(-1).nonzero()[0]
 
     # Of the two that may meet in a corner the one in which the cell lies deeper.
-    far, away = far.reshape(2, -1)[:, cell], middle.reshape(2, -1)[:, cell] > 0
-    across = far[0] > far[1]
-    return cell, np.where(across, away[0], 2 + away[1])
+    at = middle.reshape(-1).take(cell)
+    across = far_x.reshape(-1).take(cell) > far_z.reshape(-1).take(cell)
+    wall = np.where(across, at.real > 0, 2 + (at.imag > 0))
 
-
-def _goal(middle: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Return the cells in which the goal's strip lies, by their `middle` [2, n, 20, 20]."""
-    reach = (CELL_HALF * spread)[:, None, None]
-    x, z = middle
-    touches = (z <= GOAL_HIGH + reach) & (z >= GOAL_LOW - reach) & (np.abs(x) <= GOAL_HALF_X + reach)
-    return np.flatnonzero(touches)
-
-
-def _beside_corners(view: View, spread: np.ndarray) -> np.ndarray:
-    """Return bool [n, 20, 20]: which cells a square of half-width 13 m around the area's middle overlaps.
-
-    By the cells' own axes; by the area's axes their distance says it.
-    """
-    reach = (OUTER * spread)[:, None] + CELL_HALF
-    right = _RIGHT + (view.x * view.cos - view.z * view.sin)[:, None]
-    ahead = _AHEAD + (view.x * view.sin + view.z * view.cos)[:, None]
-    return np.asarray((np.abs(right) <= reach)[:, :, None] & (np.abs(ahead) <= reach)[:, None])
+    goal = np.abs(middle.imag - 0.5 * (GOAL_LOW + GOAL_HIGH)) <= reach + 0.5 * (GOAL_HIGH - GOAL_LOW)
+    goal &= far_x <= GOAL_HALF_X + reach
+    return cell, wall, goal.reshape(-1).nonzero()[0]
 
 
 def _bodies(
-    view: View, place: np.ndarray, yaw: np.ndarray, half: np.ndarray, tag: np.ndarray, seen: np.ndarray
+    view: View, place: np.ndarray, turn: np.ndarray, half: np.ndarray, tag: np.ndarray, seen: np.ndarray
 ) -> Bodies:
     """Find the boxes in the grids, turned about the vertical, and their cells."""
-    sin, cos = view.sin[:, None], view.cos[:, None]
-    offset_x, offset_z = place[..., 0] - view.x[:, None], place[..., 1] - view.z[:, None]
-    right, ahead = offset_x * cos - offset_z * sin, offset_x * sin + offset_z * cos
-    radius = np.sqrt((half**2).sum(axis=2)) + CELL_HALF
-    seen = seen & (np.abs(right) <= _RIGHT[0] + radius) & (ahead >= -radius) & (ahead <= CELLS + radius)
-    agent, body = seen.nonzero()
-    right, ahead, radius, half = right[seen], ahead[seen], radius[seen], half[seen]
-    turn = turns_of(yaw[seen])
-    turn_in_grid = turn * (view.cos + 1j * view.sin)[agent]
+    # Where a body is, in cells: the middle of cell (h, w) is (h, w).
+    forward = view.turn.conj()
+    offset = (place - view.place[:, None]) * forward[:, None]
+    radius = np.abs(half) + CELL_HALF
+    at = np.array((_MIDDLE_CELL - offset.real, offset.imag - CELL_HALF))
+    shown = (np.abs(at - _MIDDLE_CELL) <= radius + _MIDDLE_CELL).all(axis=0) & seen
+    row = shown.reshape(-1).nonzero()[0]
+    agent, body = np.divmod(row, shown.shape[1])
+    place, turn, half, radius = (part.reshape(-1).take(row) for part in (place, turn, half, radius))
+    at = at.reshape(2, -1).take(row, axis=1)
 
-    # Only the cells around a body are looked at: h falls to the right.
+    # Only the cells around a body are looked at.
     window = np.arange(int(2 * radius.max(initial=0.0)) + 1)
-    h = np.ceil(_RIGHT[0] - right - radius).astype(np.int64)[:, None] + window
-    w = np.ceil(ahead - radius - CELL_HALF).astype(np.int64)[:, None] + window
-    beside = ((_RIGHT[0] - h) - right[:, None])[:, :, None]
-    before = (w + CELL_HALF - ahead[:, None])[:, None]
+    index = np.ceil(at - radius)[:, :, None] + window
+    beside, before = away = index - at[:, :, None]
 
     # Separating axes of two rectangles: the cell's two, then the body's two.
-    s, c = -turn_in_grid.imag[:, None, None], turn_in_grid.real[:, None, None]
-    half_x, half_z = half[:, 0, None, None], half[:, 1, None, None]
-    spread = CELL_HALF * (np.abs(s) + np.abs(c))
-    reach_right, reach_ahead = CELL_HALF + plan_extents(turn_in_grid, half).T[:, :, None, None]
-    inside = (np.abs(beside) <= reach_right) & (np.abs(before) <= reach_ahead)
-    inside &= np.abs(beside * c - before * s) <= half_x + spread
-    inside &= np.abs(beside * s + before * c) <= half_z + spread
-    inside &= ((h >= 0) & (h < CELLS))[:, :, None] & ((w >= 0) & (w < CELLS))[:, None]
+    turn_in_grid = turn * forward.take(agent)
+    extent = plan_extents(turn_in_grid, half).view(float).reshape(-1, 2).T + CELL_HALF
+    near = (np.abs(away) <= extent[:, :, None]) & (np.abs(index - _MIDDLE_CELL) < CELLS / 2)
+    inside = near[0][:, :, None] & near[1][:, None]
 
-    pair, i, j = inside.nonzero()
-    cell = (agent[pair] * CELLS + h[pair, i]) * CELLS + w[pair, j]
-    centre, extent = place[seen], plan_extents(turn, half)
-    return Bodies(cell, pair, tag[body], np.array((centre - extent, centre + extent)).swapaxes(1, 2))
+    cos, sin = turn_in_grid.real[:, None], turn_in_grid.imag[:, None]
+    spread = CELL_HALF * (np.abs(cos) + np.abs(sin))
+    right, ahead = (half.real[:, None] + spread)[..., None], (half.imag[:, None] + spread)[..., None]
+    inside &= np.abs((beside * cos)[:, :, None] - (before * sin)[:, None]) <= right
+    inside &= np.abs((beside * sin)[:, :, None] + (before * cos)[:, None]) <= ahead
+
+    h, w = index.astype(np.int64)
+    cell = (agent[:, None] * CELLS**2 + h * CELLS)[:, :, None] + w[:, None]
+    found = inside.reshape(-1).nonzero()[0]
+    extent = plan_extents(turn, half)
+    bounds = np.array((place - extent, place + extent)).view(float).reshape(2, -1, 2).swapaxes(1, 2)
+    return Bodies(cell.reshape(-1).take(found), found // len(window) ** 2, tag.take(body), bounds)

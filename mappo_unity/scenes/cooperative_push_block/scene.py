@@ -26,7 +26,7 @@ from mappo_unity.scenes.push_block.agents import (
     drives,
 )
 from mappo_unity.scenes.push_block.bodies import SlidingBoxes
-from mappo_unity.scenes.push_block.contacts import Room
+from mappo_unity.scenes.push_block.contacts import Room, as_complex, turns_of
 from mappo_unity.scenes.push_block.spawn import SPAWN_Y, at_query_height, draw_spots
 
 NUM_AGENTS, NUM_BLOCKS = 3, 6
@@ -72,7 +72,7 @@ class CooperativePushBlock(Scene):
         self.boxes.place[:] = 1e3 * np.arange(1, NUM_BODIES + 1)[:, None]  # nowhere before the first reset
         self.slots = np.arange(self.num_slots).reshape(self.num_areas, NUM_AGENTS)
         self.timer = np.zeros(self.num_areas, np.int64)  # ticks since the area's reset
-        self._drive = np.zeros((self.num_areas, NUM_BODIES, 2))
+        self._drive = np.zeros((self.num_areas, NUM_BODIES), complex)
 
     def reset(self) -> None:
         """Reset the academy; only the first time are the areas made anew, as in Unity."""
@@ -88,19 +88,18 @@ class CooperativePushBlock(Scene):
         """Return the grids, and the velocity in the agent's frame (with a constant pose)."""
         area, agent = np.divmod(slots, NUM_AGENTS)
         boxes = self.boxes
-        yaw = boxes.yaw[area, agent]
-        sin, cos = np.sin(yaw), np.cos(yaw)
-        x, z = boxes.place[area, agent].T
+        place, turn = as_complex(boxes.place)[area], turns_of(boxes.yaw)[area]
+        row = np.arange(len(slots))
+        mine = turn[row, agent]
         seen = boxes.present[area] & (np.arange(NUM_BODIES) != agent[:, None])
-        cells = grid.look(
-            grid.View(x, z, sin, cos), boxes.place[area], boxes.yaw[area], boxes.half[area], TAGS, seen
-        )
+        view = grid.View(place[row, agent], mine)
+        cells = grid.look(view, place, turn, as_complex(boxes.half)[area], TAGS, seen)
 
         velocity_x, velocity_z, _ = boxes.motion[area, agent].T
+        velocity = (velocity_x + 1j * velocity_z) * mine.conj()
         body = np.zeros((len(slots), 10), np.float32)
-        body[:, 0] = velocity_x * cos - velocity_z * sin
+        body[:, 0], body[:, 2] = velocity.real, velocity.imag
         body[:, 1] = boxes.fall[area, agent]
-        body[:, 2] = velocity_x * sin + velocity_z * cos
         body[:, 9] = 1.0  # the pose relative to the agent itself: no offset, no rotation
         return [cells, body]
 
@@ -113,9 +112,9 @@ class CooperativePushBlock(Scene):
     def controllers(self) -> None:
         """Count the areas' time, interrupt groups at its limit, then charge every group for the tick."""
         self.timer += 1
-        late = np.flatnonzero(self.timer >= TIME_LIMIT)
-        if late.size:
-            self._end_groups(late, interrupted=True)
+        late = self.timer >= TIME_LIMIT
+        if np.count_nonzero(late):
+            self._end_groups(late.nonzero()[0], interrupted=True)
         self.agents.group_reward += TICK_REWARD
 
     def simulate(self) -> None:
@@ -125,7 +124,7 @@ class CooperativePushBlock(Scene):
         blocks = slice(NUM_AGENTS, NUM_BODIES)
         entered = boxes.place[:, blocks, 1] - boxes.extent[:, blocks, 1] < GOAL_FACE
         entered &= boxes.present[:, blocks]
-        if not entered.any():
+        if not np.count_nonzero(entered):
             return
 
         boxes.present[:, blocks] &= ~entered

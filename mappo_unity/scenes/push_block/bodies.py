@@ -3,7 +3,8 @@
 All boxes stand upright, so that contacts are found from above (`contacts.py`) and solved in the plane
 (`solver.py`); heights only matter for the fall after a reset. As in Unity's engine: forces and drag, then
 contacts with the floor's friction, then motion; overlaps that are left after it are pushed apart.
-Legend: N areas, B bodies of an area. Area coordinates: x right, y up, z forward; metres; floor at y = 0.
+Legend: N areas, B bodies of an area, M = N B bodies of all areas in a row, K pairs of them. Area coordinates:
+x right, y up, z forward; metres; floor at y = 0.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mappo_unity.scenes.core.ground import BOX_FRICTION, TICK_S
+from mappo_unity.scenes.core.ground import BOX_FRICTION, CONTACT_GAP, TICK_S
 from mappo_unity.scenes.push_block.contacts import (
+    Meeting,
     Outlines,
     Room,
     as_complex,
@@ -22,6 +24,7 @@ from mappo_unity.scenes.push_block.contacts import (
     near_pairs,
     pair_contacts,
     plan_extents,
+    swapped,
     turns_of,
     wall_contacts,
 )
@@ -41,11 +44,11 @@ class SlidingBoxes:
 
     Attributes, float64, to be read and written in place: `place` [N, B, 2], x and z of the centres; `height`
     [N, B]; `yaw` [N, B], rad, clockwise from above; `motion` [N, B, 3], velocity along x and z (m/s) and spin
-    (rad/s); `fall` [N, B], vertical velocity; `half` [N, B, 2], half sizes along right and
-    forward, to be changed by `resize`; `kept` [N, B], share of the speed that drag leaves in a tick; `hold`,
-    `rub` [N, B], static and dynamic friction with the floor, doubled (`ground.py`);
-    `present` bool [N, B]; `gravity`, m/s^2. To be read: `extent` [N, B, 2], how far they reach along x and z
-    since the last tick.
+    (rad/s); `fall` [N, B], vertical velocity; `kept` [N, B], share of the speed that drag leaves in a tick;
+    `present` bool [N, B]; `gravity`, m/s^2. To be read: `half` [N, B, 2], half sizes along right and forward
+    (`resize` changes them); `hold`, `rub` [N, B], static and dynamic friction with the floor, doubled
+    (`ground.py`; `set_friction` changes them); `extent` [N, B, 2], how far they reach along x and z since the
+    last tick.
 
     Arguments: `half` [B, 3] (right, up, forward), `mass` [B] kg, `drag` [B] 1/s; `turns` [B]: whether
     contacts turn a body (else its yaw is only set); `room`: faces of the walls.
@@ -61,14 +64,17 @@ class SlidingBoxes:
         room: Room,
         gravity: float,
     ) -> None:
-        shape = (num_areas, len(mass))
+        shape = num_areas, bodies = num_areas, len(mass)
         self.room, self.gravity = room, gravity
         self.rest = np.asarray(half)[:, 1]  # height of the centre on the floor
 
+        # The solver wants a row for each part of the motion; who is outside sees three numbers a body.
+        self._motion = np.zeros((3, num_areas * bodies))
+        self.motion = self._motion.reshape(3, *shape).transpose(1, 2, 0)
         self.place = np.zeros((*shape, 2))
+        self._centre = as_complex(self.place).reshape(-1)
         self.height = np.tile(self.rest, (num_areas, 1))
         self.yaw = np.zeros(shape)
-        self.motion = np.zeros((*shape, 3))
         self.fall = np.zeros(shape)
 
         self.half = np.tile(np.asarray(half)[:, ::2], (num_areas, 1, 1)).astype(float)
@@ -77,52 +83,65 @@ class SlidingBoxes:
         self.present = np.ones(shape, bool)
 
         self.extent = self.half.copy()
-        self._mass = np.asarray(mass, float)
-        self._turns = np.asarray(turns, bool)
-        self._any_turns = bool(self._turns.any())
-        self._table = np.zeros((*shape, 4), complex)
+        self._mass = np.tile(np.asarray(mass, float), num_areas)
+        self._turns = np.tile(np.asarray(turns, bool), num_areas)
+        self._pairs = _pairs(num_areas, bodies)
+        self._table = np.zeros((4, num_areas * bodies), complex)
         self._weigh()
 
     def step(self, drive: np.ndarray) -> None:
-        """Advance by one tick; `drive` [N, B, 2]: velocity changes along x and z, m/s."""
-        motion = self.motion
-        motion[..., :2] += drive
-        motion[..., :2] *= self.kept[..., None]
-        if self._any_turns:
-            spin = motion[..., 2] * SPIN_KEPT
-            motion[..., 2] = np.minimum(np.maximum(spin, -MAX_SPIN), MAX_SPIN)
+        """Advance by one tick; `drive` complex [N, B]: velocity changes x + iz, m/s."""
+        motion, spin = self._motion, self._motion[2]
+        motion[0] += drive.real.reshape(-1)
+        motion[1] += drive.imag.reshape(-1)
+        motion[:2] *= self.kept.reshape(-1)
+        if np.count_nonzero(spin):
+            spin *= SPIN_KEPT
+            np.minimum(np.maximum(spin, -MAX_SPIN, out=spin), MAX_SPIN, out=spin)
         landed = self._land()
 
-        boxes, turns = self.outlines(), self._turns
-        contacts, near = pair_contacts(boxes, motion, turns)
-        contacts = joined(contacts, wall_contacts(boxes, self.room, motion, turns))
+        boxes, velocity = self.outlines(), motion[0] + 1j * motion[1]
+        near = near_pairs(boxes, self._pairs, np.abs(velocity) * TICK_S + CONTACT_GAP)
+        meeting = meet(boxes, near)
+        contacts = joined(
+            pair_contacts(meeting, velocity, self._turns),
+            wall_contacts(boxes, self.room, motion, self._turns),
+        )
         solve(contacts, motion, self._weight, self._floor(landed))
 
-        self.place += motion[..., :2] * TICK_S
-        if self._any_turns:
-            self.yaw += motion[..., 2] * TICK_S
-        self._separate(near)
+        self._centre += (motion[0] + 1j * motion[1]) * TICK_S
+        turned = bool(np.count_nonzero(spin))
+        if turned:
+            self.yaw += spin.reshape(self.yaw.shape) * TICK_S
+            boxes = self.outlines()
+        self._separate(boxes, meeting, turned)
 
     def resize(self, areas: np.ndarray, body: int, half: np.ndarray) -> None:
         """Give a body of `areas` [n] other half sizes along its right and forward, [n, 2] m; mass stays."""
         self.half[areas, body] = half
         self._weigh()
 
+    def set_friction(self, areas: np.ndarray, hold: np.ndarray, rub: np.ndarray) -> None:
+        """Change the floor of `areas` [n]: static and dynamic friction, doubled, [n, 1]."""
+        self.hold[areas], self.rub[areas] = hold, rub
+        self._weigh()
+
     def outlines(self) -> Outlines:
         """Return where the boxes are, seen from above."""
-        table, turn = self._table, turns_of(self.yaw)
-        table[..., 0], table[..., 1] = as_complex(self.place), turn
-        radius = np.where(self.present, self._radius, -np.inf)
-        return Outlines(table, self.place, plan_extents(turn, self.half), radius, self.present)
+        table, present = self._table, self.present.reshape(-1)
+        table[0], table[1] = self._centre, turns_of(self.yaw.reshape(-1))
+        extent = plan_extents(table[1], table[2]).view(float).reshape(-1, 2)
+        self.extent = extent.reshape(self.place.shape)
+        radius = np.where(present, self._radius, -np.inf)
+        return Outlines(table, self.place.reshape(-1, 2), extent, radius, present)
 
     def deepest(self) -> np.ndarray:
         """Return the deepest overlap of any two boxes of an area, or of a box and a wall, [N] m."""
         boxes = self.outlines()
-        beyond = np.maximum(self.room.low - self.place, self.place - self.room.high) + boxes.extent
-        depth: np.ndarray = np.where(self.present[..., None], beyond, 0.0).max(axis=(1, 2)).clip(0.0)
-        near = near_pairs(boxes, 0.0)
-        np.maximum.at(depth, near[:, 0], -meet(boxes, near).gap)
-        return depth
+        depth = np.where(boxes.present, -self.room.gaps(boxes).min(axis=1), 0.0).clip(0.0)
+        meeting = meet(boxes, near_pairs(boxes, self._pairs, np.zeros(len(depth))))
+        np.maximum.at(depth, meeting.pairs[0], -meeting.gap)
+        return np.asarray(depth.reshape(self.yaw.shape).max(axis=1))
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return copies of all arrays."""
@@ -137,23 +156,22 @@ class SlidingBoxes:
     def _weigh(self) -> None:
         """Compute what follows from masses and sizes: inverse masses and inertia, grip against turning."""
         # Moment of inertia about the vertical, kg m^2: m (w^2 + l^2) / 12.
-        inertia = self._mass * (self.half**2).sum(axis=2) / 3.0
-        self._weight = np.empty(self.motion.shape)
-        self._weight[..., :2] = (1.0 / self._mass)[:, None]
-        self._weight[..., 2] = self._turns / inertia
-
-        half = as_complex(self.half)
-        self._table[..., 2], self._table[..., 3] = half, 1j * half.conj()
+        half = as_complex(self.half).reshape(-1)
+        self._radius = np.abs(half)
+        inertia = self._mass * self._radius**2 / 3.0
+        self._weight = np.array((1.0 / self._mass, 1.0 / self._mass, self._turns / inertia))
+        self._table[2], self._table[3] = half, swapped(half)
 
         # Spin by speed lost to the floor: the two friction anchors of a face stand in opposite corners.
-        self._radius = np.sqrt((self.half**2).sum(axis=2))
-        self._grip = self._mass * self._radius / inertia
+        grip = self._mass * self._radius / inertia
+        self._grip = np.array((-grip, grip))
+        self._is_sticky = bool((self.hold != self.rub).any())
 
     def _land(self) -> np.ndarray:
         """Fall; return the downward speed that the floor takes, [N, B] m/s."""
-        pull = self.gravity * TICK_S * self.kept
+        pull: np.ndarray = self.gravity * TICK_S * self.kept
         gap = self.height - self.rest
-        if not gap.any() and not self.fall.any():  # as nearly always
+        if not np.count_nonzero(gap) and not np.count_nonzero(self.fall):  # as nearly always
             return pull
 
         self.fall -= self.gravity * TICK_S
@@ -170,44 +188,59 @@ class SlidingBoxes:
 
     def _floor(self, landed: np.ndarray) -> Floor:
         """Return what the floor's friction can take in this tick."""
-        rub = self.rub * landed
-        return Floor(self.hold * landed, rub, rub * self._grip)
+        rub = np.maximum(self.rub * landed, 1e-12).reshape(-1)
+        hold = (self.hold * landed).reshape(-1) if self._is_sticky else rub
+        return Floor(hold, rub, rub * self._grip)
 
-    def _separate(self, pairs: np.ndarray) -> None:
+    def _separate(self, boxes: Outlines, before: Meeting, turned: bool) -> None:
         """Push overlapping boxes apart, the lighter one farther, and all of them into the room.
 
-        `pairs` int [K, 3]: area and bodies of those that were near before they moved.
+        `before`: how near ones faced each other before they moved; `turned`: whether any has turned.
         """
-        boxes = self.outlines()
-        self.extent = boxes.extent
-        low, high = self.room.low + boxes.extent, self.room.high - boxes.extent
-        self._stay_inside(low, high)
-        if not len(pairs):
+        self._stay_inside(boxes)
+        pairs, place = before.pairs, self._centre
+        if not before.gap.size:
             return
+
+        # While no face turns, those that were apart along an axis are no nearer than they are along it now.
+        if not turned:
+            moved = place.take(pairs[0]) - place.take(pairs[1]) - before.offset
+            gap = before.gap + (moved * before.normal.conj()).real
+            if not np.count_nonzero(gap < -DEEP):
+                return
 
         widened = False
         for _ in range(PUSH_ROUNDS):
-            boxes.table[..., 0] = as_complex(self.place)
+            boxes.table[0] = place
             meeting = meet(boxes, pairs)
             deep = (meeting.gap < -DEEP).nonzero()[0]
             if not deep.size:
                 break
             if not widened and meeting.gap.min() < -FAR_IN:
-                pairs, widened = near_pairs(boxes, REACH), True
+                pairs, widened = near_pairs(boxes, self._pairs, np.full(len(place), REACH)), True
                 continue
 
-            area, one, other = pairs[deep].T
-            way = (meeting.normal[deep] * -meeting.gap[deep]).view(float).reshape(-1, 2)
-            share = (self._mass[other] / (self._mass[one] + self._mass[other]))[:, None]
-            np.add.at(self.place, (area, one), way * share)
-            np.add.at(self.place, (area, other), way * (share - 1.0))
+            one, other = meeting.pairs[:, deep]
+            way = meeting.normal[deep] * -meeting.gap[deep]
+            share = self._mass[other] / (self._mass[one] + self._mass[other])
+            np.add.at(place, one, way * share)
+            np.add.at(place, other, way * (share - 1.0))
             # Against a wall the other one gives way, in the rounds that follow.
-            self._stay_inside(low, high)
+            self._stay_inside(boxes)
 
-    def _stay_inside(self, low: np.ndarray, high: np.ndarray) -> None:
-        """Put centres within `low` and `high` [N, B, 2], and stop those that went out."""
-        inside = np.minimum(np.maximum(self.place, low), high)
-        out = (inside != self.place) & self.present[..., None]
-        if out.any():
-            self.place[out] = inside[out]
-            self.motion[..., :2][out] = 0.0
+    def _stay_inside(self, boxes: Outlines) -> None:
+        """Put centres back that brought their boxes into a wall, and stop them along that axis."""
+        if not np.count_nonzero(self.room.gaps(boxes) < 0.0):
+            return
+
+        low, high = self.room.low + boxes.extent, self.room.high - boxes.extent
+        inside = np.minimum(np.maximum(boxes.place, low), high)
+        out = (inside != boxes.place) & boxes.present[:, None]
+        boxes.place[out] = inside[out]
+        self._motion[:2].T[out] = 0.0
+
+
+def _pairs(num_areas: int, bodies: int) -> np.ndarray:
+    """Return int [2, P]: all pairs of bodies of the same area, by their numbers in the row of all bodies."""
+    pairs = np.array(np.triu_indices(bodies, 1))
+    return (pairs[:, None] + np.arange(num_areas)[:, None] * bodies).reshape(2, -1)

@@ -80,7 +80,7 @@ class PushBlock(Scene):
         )
         self.boxes.yaw[:, AGENT] = FACING_GOAL
         self.boxes.place[:, BLOCK, 1] = 3.0  # beside the agent, before the first reset moves both
-        self._drive = np.zeros((self.num_areas, 2, 2))
+        self._drive = np.zeros((self.num_areas, 2), complex)
 
     def begin_episode(self, slots: np.ndarray) -> None:
         """Put the block, then the agent, at rest on free spots; headings stay; read the parameters."""
@@ -144,6 +144,9 @@ class PushBlock(Scene):
         boxes, count = self.boxes, len(slots)
         boxes.resize(slots, BLOCK, 0.5 * self.parameters.draw("block_scale", count)[:, None])
         boxes.kept[slots, BLOCK] = np.maximum(1.0 - self.parameters.draw("block_drag", count) * TICK_S, 0.0)
-        for name, limit in (("static_friction", boxes.hold), ("dynamic_friction", boxes.rub)):
-            pair = 0.5 * (self.parameters.draw(name, count) + MATERIAL_FRICTION)
-            limit[slots] = 2.0 * pair[:, None]  # two anchors: see `ground.py`
+        # Of the floor and what slides on it the mean counts, and twice, for two anchors: see `ground.py`.
+        hold, rub = (
+            self.parameters.draw(name, count)[:, None] + MATERIAL_FRICTION
+            for name in ("static_friction", "dynamic_friction")
+        )
+        boxes.set_friction(slots, hold, rub)

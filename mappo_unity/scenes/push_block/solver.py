@@ -5,7 +5,8 @@ the normal impulses of all contacts, then their friction, then the floor's frict
 have left. The floor's friction is part of the rounds, so that a heavy box stays where it is while the pushes
 against it are less than the floor can hold. Contacts of a body share its mass, so that their impulses cannot
 add up to too much.
-Legend: N areas, B bodies of an area, K contacts, C the most contacts of an area.
+Legend: M bodies of all areas in a row, K contacts, T bodies that take part: all, or of many those that touch
+something.
 """
 
 from __future__ import annotations
@@ -19,137 +20,142 @@ from mappo_unity.scenes.core.ground import BOX_FRICTION, TICK_S
 ROUNDS = 16
 HASTE = 1.2  # over-relaxation of the normal impulses; stable below 2, as bodies' masses are shared
 NEGLIGIBLE = 1e-2  # kg m/s: an impulse that ends the rounds
+FEW = 64  # so many bodies take part at once, whether they touch something or not
 WALL = -1  # instead of a body's number
 
 
 class Contacts(NamedTuple):
     """Points where bodies may touch within the tick; vectors are x + iz."""
 
-    area: np.ndarray
-    """int [K]."""
-    one: np.ndarray
-    """int [K]: body of the area."""
-    other: np.ndarray
-    """int [K]: body of the area, or WALL."""
-    normal: np.ndarray
-    """complex [K]: unit vector from the other to the one."""
-    arm: np.ndarray
-    """complex [K], m: from the one's centre to the point."""
-    other_arm: np.ndarray
-    """complex [K], m: from the other's centre to the point; anything for walls."""
+    bodies: np.ndarray
+    """int [2, K]: the one, and the other or WALL."""
+    vectors: np.ndarray
+    """complex [3, K]: unit normal from the other to the one; arms from the centres of the one and of the
+    other to the point, m (the latter is anything for walls)."""
     gap: np.ndarray
     """[K], m: may be closed within the tick; negative where they overlap."""
 
 
 class Floor(NamedTuple):
-    """What the floor takes from bodies in a tick; arrays [N, B], of speed (m/s) and of spin (rad/s)."""
+    """What the floor can take from bodies in a tick."""
 
     hold: np.ndarray
-    """The most speed that friction stops entirely (static)."""
+    """[M], m/s: the most speed that friction stops entirely (static); `rub` itself where they are equal."""
     rub: np.ndarray
-    """What it takes from a body that is faster (dynamic)."""
+    """[M], m/s: what it takes from a faster body (dynamic); above 0."""
     turn: np.ndarray
-    """The most spin that it takes."""
+    """[2, M], rad/s: the least and the most that it adds to the spin."""
 
     def limited(self, change: np.ndarray) -> np.ndarray:
-        """Return a change of motion [..., B, 3] (x, z, spin) as far as friction can make it."""
-        speed = np.hypot(change[..., 0], change[..., 1])
-        share = np.where(speed <= self.hold, 1.0, self.rub / np.maximum(speed, 1e-12))
+        """Return what friction makes of a change of motion [3, M] (x, z, spin) that would stop it."""
+        (hold, rub, (least, most)), (x, z, spin) = self, change
+        speed = np.hypot(x, z)
+        share = rub / np.maximum(speed, rub)
+        if hold is not rub:
+            share[speed <= hold] = 1.0
+
         limited = np.empty(change.shape)
-        np.multiply(change[..., :2], share[..., None], out=limited[..., :2])
-        np.minimum(np.maximum(change[..., 2], -self.turn), self.turn, out=limited[..., 2])
+        np.multiply(change[:2], share, out=limited[:2])
+        np.minimum(np.maximum(spin, least), most, out=limited[2])
         return limited
 
 
 def solve(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Floor) -> None:
     """Stop bodies from approaching and rub, in place.
 
-    `motion` [N, B, 3]: velocity along x and z (m/s) and spin (rad/s, clockwise from above); `weight`
-    [N, B, 3]: inverse masses (1/kg) and inertia (1/(kg m^2)), 0 where a body does not move.
+    `motion` [3, M]: velocity along x and z (m/s) and spin (rad/s, clockwise from above); `weight` [3, M]:
+    inverse masses (1/kg) and inertia (1/(kg m^2)), of which the latter is 0 where contacts turn nothing.
     """
-    if not contacts.area.size:
+    if not contacts.gap.size:
         motion += floor.limited(-motion)
-        return
+    elif motion.shape[1] <= FEW:
+        _solve(contacts, motion, weight, floor)
+    else:
+        _solve_few(contacts, motion, weight, floor)
 
-    count, bodies, _ = motion.shape
-    place = _places(contacts.area)
-    rows = _rows(contacts, place, (count, int(place.max()) + 1, bodies))
-    answers = rows * weight.reshape(count, 1, -1)
 
-    # Scaled by the masses at the contacts, rows turn motions into the impulses that would stop them.
-    shared = rows * _shares(contacts, (count, bodies))
-    masses = (answers * shared).sum(axis=3)
-    masses = np.where(masses > 0, 1.0 / np.maximum(masses, 1e-12), 0.0)
+def _solve_few(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Floor) -> None:
+    """Let only bodies take part that touch something; on the others the floor acts alone."""
+    touches = np.zeros(motion.shape[1] + 1, bool)
+    touches[contacts.bodies] = True
+    touches[WALL] = False
+    bodies = touches.nonzero()[0]
+    number = np.full(len(touches), WALL)
+    number[bodies] = np.arange(len(bodies))
+
+    few = motion.take(bodies, axis=1)
+    hold, rub, turn = (most.take(bodies, axis=-1) for most in floor)
+    held = Floor(rub if floor.hold is floor.rub else hold, rub, turn)
+    _solve(contacts._replace(bodies=number[contacts.bodies]), few, weight.take(bodies, axis=1), held)
+    motion += floor.limited(-motion)
+    motion[:, bodies] = few
+
+
+def _solve(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Floor) -> None:
+    """Do what `solve` does for contacts and bodies that all take part."""
+    count = motion.shape[1]
+    rows = _rows(contacts, count)
+    answers = rows * weight.ravel()
+
+    # Scaled by the masses at the contacts, rows turn motions into the impulses that would stop them. A body's
+    # mass is shared by its contacts; walls are counted in front of the bodies.
+    share = np.bincount((contacts.bodies + 1).ravel(), minlength=count + 1)[1:]
+    masses = 1.0 / (rows * rows).dot((weight * share).ravel())
     masses[0] *= HASTE
-    rows *= masses[..., None]
+    masses[1] /= BOX_FRICTION  # so that friction is at most the normal impulse
+    rows *= masses[:, :, None]
+    answers[1] *= BOX_FRICTION
 
-    allowed = np.zeros(masses[0].shape)  # approach that only closes a gap, m/s
-    allowed[contacts.area, place] = np.maximum(contacts.gap, 0.0) / TICK_S
-    _rounds(motion, rows, answers, masses[0] * allowed, floor)
+    allowed = masses[0] * np.maximum(contacts.gap, 0.0) / TICK_S  # for approach that only closes a gap
+    _rounds(motion, rows, answers, allowed, floor)
 
 
 def _rounds(
     motion: np.ndarray, rows: np.ndarray, answers: np.ndarray, allowed: np.ndarray, floor: Floor
 ) -> None:
-    """Add what all impulses do to the motion [N, B, 3].
+    """Add what all impulses do to the motion [3, T].
 
-    `rows` [2, N, C, 3 B]: normal impulses by motion, and those of friction; `answers` [2, N, C, 3 B]: motion
-    by impulse; `allowed` [N, C]: what normal impulses may lack, kg m/s.
+    `rows` [2, K, 3 T]: normal impulses by motion, and those of friction by its coefficient; `answers` [2, K,
+    3 T]: motion by either; `allowed` [K]: what normal impulses may lack, kg m/s.
     """
-    (along, across), (push, rub) = rows.swapaxes(2, 3), answers
-    flat, allowed = motion.reshape(len(motion), 1, -1), allowed[:, None]  # the motion itself, in a row
-    impulse = friction = np.zeros(allowed.shape)
+    (along, across), (push, rub) = rows, answers  # `dot` takes half the time of `@` on arrays so small
+    flat = motion.reshape(-1)  # the motion itself, in a row
+    impulse = friction = np.zeros(len(along))
     held = np.zeros(motion.shape)  # what the floor has taken so far
 
     for _ in range(ROUNDS):
         # An impulse may shrink again in a later round, but it never pulls.
-        grown = np.maximum(impulse - flat @ along - allowed, 0.0)
+        grown = np.maximum(impulse - along.dot(flat) - allowed, 0.0)
         change = grown - impulse
         impulse = grown
-        flat += change @ push
+        flat += change.dot(push)
 
-        limit = BOX_FRICTION * impulse
-        rubbed = np.minimum(np.maximum(friction - flat @ across, -limit), limit)
-        flat += (rubbed - friction) @ rub
+        rubbed = np.minimum(np.maximum(friction - across.dot(flat), -impulse), impulse)
+        flat += (rubbed - friction).dot(rub)
         friction = rubbed
 
-        taken = floor.limited(held - motion)
-        motion += taken - held
-        held = taken
-        if np.abs(change).max() < NEGLIGIBLE:
+        stopping = held - motion
+        held = floor.limited(stopping)
+        np.subtract(held, stopping, out=motion)
+        if not np.count_nonzero(np.abs(change) >= NEGLIGIBLE):
             break
 
 
-def _rows(contacts: Contacts, place: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    """Return what turns motions into speeds at contacts, [2, N, C, 3 B]: along the normals, across them."""
-    (count, width, bodies), normal = shape, contacts.normal
-    lever = normal.conj() * np.array((contacts.arm, contacts.other_arm))
+def _rows(contacts: Contacts, count: int) -> np.ndarray:
+    """Return what turns motions of `count` bodies into speeds at contacts, along and across, [2, K, 3 T]."""
+    normal, arms = contacts.vectors[0], contacts.vectors[1:, None]
+
+    # Who takes part: 1 for the one, -1 for the other; walls, in the last column, are cut off.
+    part, each = np.zeros((2, len(normal), count + 1)), np.arange(len(normal))
+    part[0, each, contacts.bodies[0]], part[1, each, contacts.bodies[1]] = 1.0, -1.0
+    mine, theirs = part[:, :, :count]
 
     # Speed of a point at an arm (r_x, r_z): v_x + spin * r_z, v_z - spin * r_x.
-    each = np.empty((2, *lever.shape, 3))
-    each[0, ..., 0], each[0, ..., 1], each[0, ..., 2] = normal.real, normal.imag, lever.imag
-    each[1, ..., 0], each[1, ..., 1], each[1, ..., 2] = normal.imag, -normal.real, lever.real
-
-    # Walls have the last column, which is cut off.
-    rows = np.zeros((2, count, width, bodies + 1, 3))
-    rows[:, contacts.area, place, contacts.one] = each[:, 0]
-    rows[:, contacts.area, place, contacts.other] = -each[:, 1]
-    return rows[:, :, :, :bodies].reshape(2, count, width, -1)
-
-
-def _shares(contacts: Contacts, shape: tuple[int, int]) -> np.ndarray:
-    """Return [N, 1, 3 B]: how many contacts a body has, at least 1, for each part of its motion."""
-    count, bodies = shape
-    first = contacts.area * (bodies + 1) + 1  # the first column is that of the walls
-    touched = np.concatenate((first + contacts.one, first + contacts.other))
-    share = np.maximum(np.bincount(touched, minlength=count * (bodies + 1)), 1.0)
-    return np.repeat(share.reshape(count, 1, -1)[..., 1:], 3, axis=2)
-
-
-def _places(area: np.ndarray) -> np.ndarray:
-    """Return int [K]: the place of each contact among those of its area."""
-    order = np.argsort(area, kind="stable")
-    ordered = area[order]
-    place = np.empty_like(area)
-    place[order] = np.arange(len(area)) - np.searchsorted(ordered, ordered)
-    return place
+    way = np.array((normal, -1j * normal))
+    lever, other_lever = (way.conj() * arms).imag[..., None]
+    way = way[:, :, None]
+    rows, both = np.empty((2, len(normal), 3, count)), mine + theirs
+    np.multiply(way.real, both, out=rows[:, :, 0])
+    np.multiply(way.imag, both, out=rows[:, :, 1])
+    np.add(lever * mine, other_lever * theirs, out=rows[:, :, 2])
+    return rows.reshape(2, len(normal), 3 * count)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mappo_unity.scenes.push_block.contacts import plan_extents, turns_of
+from mappo_unity.scenes.push_block.contacts import as_complex, plan_extents, turns_of
 
 RANGE = 6.25  # m: x and z of a spot, half the floor's half-width
 SPAWN_Y = 1.0
@@ -59,8 +59,9 @@ def _overlaps(
     x, z = offset[..., 0], offset[..., 1]
 
     # Separating axes of two rectangles: the area's two, then the body's own two.
-    beside = np.abs(offset) < query + plan_extents(turn, half[:, None])
+    extent = plan_extents(turn, as_complex(half)[:, None])
+    beside = (np.abs(x) < query + extent.real) & (np.abs(z) < query + extent.imag)
     reach = query * (np.abs(sin) + np.abs(cos))
     right = np.abs(x * cos - z * sin) < half[:, None, :, 0] + reach
     ahead = np.abs(x * sin + z * cos) < half[:, None, :, 1] + reach
-    return np.asarray(beside.all(axis=3) & right & ahead)
+    return np.asarray(beside & right & ahead)
