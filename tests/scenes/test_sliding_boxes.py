@@ -121,3 +121,18 @@ def test_absent_bodies_are_not_met() -> None:
     for _ in range(20):
         boxes.step(drive)
     assert boxes.place[0, 0, 1] > 2.0 and boxes.place[0, 1, 1] == 0.0
+
+
+@pytest.mark.parametrize("speed", [12.0, 17.7, 30.0])
+def test_who_is_hit_does_not_enter_the_next_one(speed: float) -> None:
+    """An agent runs into a second one, which stands just before a third, corner to corner."""
+    boxes = pushed("small", 3, ticks=0)
+    boxes.place[0, :, 0] = 0.0
+    boxes.place[0, :, 1] = -1.25, 0.0, 1.46, 20.0  # the last one is the block
+    boxes.yaw[0, 1:3] = np.pi / 4
+    boxes.motion[0, 0, 1] = speed
+
+    for _ in range(20):
+        boxes.step(np.zeros((1, 4), complex))
+        assert boxes.deepest()[0] < 0.002
+    assert boxes.place[0, 2, 1] > 1.5

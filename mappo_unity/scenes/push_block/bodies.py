@@ -33,7 +33,7 @@ from mappo_unity.scenes.push_block.solver import Floor, solve
 MAX_SPIN = 7.0  # rad/s: the engine's limit
 SPIN_KEPT = 1.0 - 0.05 * TICK_S
 PUSH_ROUNDS = 40  # only turned blocks at a reset need more than a few
-FAR_IN, REACH = 0.05, 0.7  # m: from there on also those that come into the way are looked at, so far off
+FAR_IN, REACH = 0.05, 1.4  # m: from there on also those that come into the way are looked at, so far off
 DEEP = 1e-3  # m: overlaps below this are left to the next tick
 
 _STATE = ("place", "height", "yaw", "motion", "fall", "half", "kept", "hold", "rub", "present")
@@ -86,6 +86,7 @@ class SlidingBoxes:
         self._mass = np.tile(np.asarray(mass, float), num_areas)
         self._turns = np.tile(np.asarray(turns, bool), num_areas)
         self._pairs = _pairs(num_areas, bodies)
+        self._pairs_of_area = self._pairs.shape[1] // num_areas
         self._table = np.zeros((4, num_areas * bodies), complex)
         self._weigh()
 
@@ -101,8 +102,10 @@ class SlidingBoxes:
         landed = self._land()
 
         boxes, velocity = self.outlines(), motion[0] + 1j * motion[1]
-        near = near_pairs(boxes, self._pairs, np.abs(velocity) * TICK_S + CONTACT_GAP)
-        meeting = meet(boxes, near)
+        # Who is hit may leave as fast as the fastest of its area came.
+        speed = np.abs(velocity).reshape(self.yaw.shape).max(axis=1)
+        reach = 2.0 * (speed * TICK_S + CONTACT_GAP)
+        meeting = meet(boxes, near_pairs(boxes, self._pairs, reach.repeat(self._pairs_of_area)))
         contacts = joined(
             pair_contacts(meeting, velocity, self._turns),
             wall_contacts(boxes, self.room, motion, self._turns),
@@ -139,7 +142,7 @@ class SlidingBoxes:
         """Return the deepest overlap of any two boxes of an area, or of a box and a wall, [N] m."""
         boxes = self.outlines()
         depth = np.where(boxes.present, -self.room.gaps(boxes).min(axis=1), 0.0).clip(0.0)
-        meeting = meet(boxes, near_pairs(boxes, self._pairs, np.zeros(len(depth))))
+        meeting = meet(boxes, near_pairs(boxes, self._pairs, 0.0))
         np.maximum.at(depth, meeting.pairs[0], -meeting.gap)
         return np.asarray(depth.reshape(self.yaw.shape).max(axis=1))
 
@@ -217,7 +220,7 @@ class SlidingBoxes:
             if not deep.size:
                 break
             if not widened and meeting.gap.min() < -FAR_IN:
-                pairs, widened = near_pairs(boxes, self._pairs, np.full(len(place), REACH)), True
+                pairs, widened = near_pairs(boxes, self._pairs, REACH), True
                 continue
 
             one, other = meeting.pairs[:, deep]
@@ -241,6 +244,6 @@ class SlidingBoxes:
 
 
 def _pairs(num_areas: int, bodies: int) -> np.ndarray:
-    """Return int [2, P]: all pairs of bodies of the same area, by their numbers in the row of all bodies."""
+    """Return int [2, P]: pairs of bodies of the same area, area by area; bodies as numbered in one row."""
     pairs = np.array(np.triu_indices(bodies, 1))
     return (pairs[:, None] + np.arange(num_areas)[:, None] * bodies).reshape(2, -1)

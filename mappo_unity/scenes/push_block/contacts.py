@@ -92,10 +92,10 @@ def swapped(half: np.ndarray) -> np.ndarray:
     return 1j * half.conj()
 
 
-def near_pairs(boxes: Outlines, pairs: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Return those of `pairs` int [2, P] whose circles meet, enlarged by `reach` [M] m."""
-    centre, radius = boxes.table[0].take(pairs), (boxes.radius + reach).take(pairs)
-    near = np.abs(centre[0] - centre[1]) < radius[0] + radius[1]
+def near_pairs(boxes: Outlines, pairs: np.ndarray, reach: np.ndarray | float) -> np.ndarray:
+    """Return those of `pairs` int [2, P] whose circles come nearer than `reach` [P] or one, m."""
+    centre, radius = boxes.table[0].take(pairs), boxes.radius.take(pairs)
+    near = np.abs(centre[0] - centre[1]) < radius[0] + radius[1] + reach
     return pairs.take(near.nonzero()[0], axis=1)
 
 
