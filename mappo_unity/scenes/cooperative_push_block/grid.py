@@ -103,12 +103,12 @@ def _fixed(view: View, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     reach = (CELL_HALF * spread)[:, None]
     far_x, far_z = np.abs(middle.real), np.abs(middle.imag)
 
-    # The walls make a frame around the room: by the area's axes, then by the cells' own.
+    # The walls make a frame around the room. Separating axes: the area's, then the cells' own.
     farthest = np.maximum(far_x, far_z)
     framed = np.abs(farthest - 0.5 * (INNER + OUTER)) <= reach + 0.5 * (OUTER - INNER)
-    along = (view.place * view.turn.conj()).view(float).reshape(-1, 2, 1)
-    beside = np.abs(_MIDDLES + along) <= (OUTER * spread + CELL_HALF)[:, None, None]
-    framed &= (beside[:, 0, :, None] & beside[:, 1, None]).reshape(framed.shape)
+    place = (view.place * view.turn.conj()).view(float).reshape(-1, 2, 1)  # in the grid's axes
+    within = np.abs(_MIDDLES + place) <= (OUTER * spread + CELL_HALF)[:, None, None]
+    framed &= (within[:, 0, :, None] & within[:, 1, None]).reshape(framed.shape)
     cell = framed.reshape(-1).nonzero()[0]
 
     # Of the two that may meet in a corner the one in which the cell lies deeper.
@@ -124,10 +124,10 @@ def _fixed(view: View, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 def _bodies(
     view: View, place: np.ndarray, turn: np.ndarray, half: np.ndarray, tag: np.ndarray, seen: np.ndarray
 ) -> Bodies:
-    """Find the boxes in the grids, turned about the vertical, and their cells."""
+    """Find the boxes in the grids, turned about the vertical, and their cells; arguments as for `look`."""
     # Where a body is, in cells: the middle of cell (h, w) is (h, w).
-    forward = view.turn.conj()
-    offset = (place - view.place[:, None]) * forward[:, None]
+    into_grid = view.turn.conj()
+    offset = (place - view.place[:, None]) * into_grid[:, None]
     radius = np.abs(half) + CELL_HALF
     at = np.array((_MIDDLE_CELL - offset.real, offset.imag - CELL_HALF))
     shown = (np.abs(at - _MIDDLE_CELL) <= radius + _MIDDLE_CELL).all(axis=0) & seen
@@ -142,7 +142,7 @@ def _bodies(
     beside, before = away = index - at[:, :, None]
 
     # Separating axes of two rectangles: the cell's two, then the body's two.
-    turn_in_grid = turn * forward.take(agent)
+    turn_in_grid = turn * into_grid.take(agent)
     extent = plan_extents(turn_in_grid, half).view(float).reshape(-1, 2).T + CELL_HALF
     near = (np.abs(away) <= extent[:, :, None]) & (np.abs(index - _MIDDLE_CELL) < CELLS / 2)
     inside = near[0][:, :, None] & near[1][:, None]

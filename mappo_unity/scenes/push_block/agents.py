@@ -12,7 +12,6 @@ AGENT_MASS, AGENT_DRAG = 10.0, 4.0  # kg, 1/s
 BLOCK_HALF_Y = 0.375
 BLOCK_DRAG = 0.5  # 1/s
 
-
 # What an action gives in a tick: speed to the right + i ahead (m/s), turn to the right (rad).
 _PUSH, _TURN = ACTIONS[:, 1] + 1j * ACTIONS[:, 0], ACTIONS[:, 2]
 
