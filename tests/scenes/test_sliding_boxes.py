@@ -12,11 +12,11 @@ GRAVITY = 14.715  # the cooperative scene's
 BLOCKS = {"small": (0.5, 10.0), "large": (1.0, 100.0), "very large": (1.5, 150.0)}  # half width m, mass kg
 
 
-def pushed(block: str, agents: int, ticks: int = 100, walls: float = 50.0) -> SlidingBoxes:
+def pushed(block: str, agents: int, ticks: int = 100, walls: float = 50.0, areas: int = 1) -> SlidingBoxes:
     """Let agents side by side push a block from its south side; it stands in the middle at the start."""
     half, mass = BLOCKS[block]
     boxes = SlidingBoxes(
-        1,
+        areas,
         half=np.array([[0.5, 0.5, 0.5]] * agents + [[half, 0.375, half]]),
         mass=[10.0] * agents + [mass],
         drag=[4.0] * agents + [0.5],
@@ -24,10 +24,10 @@ def pushed(block: str, agents: int, ticks: int = 100, walls: float = 50.0) -> Sl
         room=Room(np.full(2, -walls), np.full(2, walls)),
         gravity=GRAVITY,
     )
-    boxes.place[0, :agents, 0] = 1.02 * (np.arange(agents) - (agents - 1) / 2)
-    boxes.place[0, :agents, 1] = -half - 0.5
-    drive = np.zeros((1, agents + 1), complex)
-    drive[0, :agents] = 3j
+    boxes.place[:, :agents, 0] = 1.02 * (np.arange(agents) - (agents - 1) / 2)
+    boxes.place[:, :agents, 1] = -half - 0.5
+    drive = np.zeros((areas, agents + 1), complex)
+    drive[:, :agents] = 3j
     for _ in range(ticks):
         boxes.step(drive)
         assert boxes.deepest()[0] < 0.01
@@ -136,3 +136,11 @@ def test_who_is_hit_does_not_enter_the_next_one(speed: float) -> None:
         boxes.step(np.zeros((1, 4), complex))
         assert boxes.deepest()[0] < 0.002
     assert boxes.place[0, 2, 1] > 1.5
+
+
+@pytest.mark.parametrize("areas", [3, 40])
+def test_an_area_moves_as_it_does_alone(areas: int) -> None:
+    """Few areas make one system of contacts, many a system each."""
+    alone, among = pushed("large", 3, walls=4.0), pushed("large", 3, walls=4.0, areas=areas)
+    for name, state in alone.get_state().items():
+        np.testing.assert_allclose(among.get_state()[name], state.repeat(areas, axis=0), atol=1e-9)

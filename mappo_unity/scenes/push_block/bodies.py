@@ -28,7 +28,7 @@ from mappo_unity.scenes.push_block.contacts import (
     turns_of,
     wall_contacts,
 )
-from mappo_unity.scenes.push_block.solver import Floor, solve
+from mappo_unity.scenes.push_block.solver import Floor, solve, systems_of
 
 MAX_SPIN = 7.0  # rad/s: the engine's limit
 SPIN_KEPT = 1.0 - 0.05 * TICK_S
@@ -68,9 +68,10 @@ class SlidingBoxes:
         self.room, self.gravity = room, gravity
         self.rest = np.asarray(half)[:, 1]  # height of the centre on the floor
 
-        # The solver wants a row for each part of the motion; who is outside sees three numbers a body.
-        self._motion = np.zeros((3, num_areas * bodies))
-        self.motion = self._motion.reshape(3, *shape).transpose(1, 2, 0)
+        # The solver wants a row for each part of a system's motion; who is outside sees three numbers a body.
+        *many, size = self._systems = systems_of(num_areas, bodies)
+        self._motion = np.zeros((*many, 3, size))
+        self.motion = np.moveaxis(self._motion, -2, 0).reshape(3, *shape).transpose(1, 2, 0)
         self.place = np.zeros((*shape, 2))
         self._centre = as_complex(self.place).reshape(-1)
         self.height = np.tile(self.rest, (num_areas, 1))
@@ -92,30 +93,31 @@ class SlidingBoxes:
 
     def step(self, drive: np.ndarray) -> None:
         """Advance by one tick; `drive` complex [N, B]: velocity changes x + iz, m/s."""
-        motion, spin = self._motion, self._motion[2]
-        motion[0] += drive.real.reshape(-1)
-        motion[1] += drive.imag.reshape(-1)
-        motion[:2] *= self.kept.reshape(-1)
+        x, z, spin = self.motion.transpose(2, 0, 1)
+        x += drive.real
+        z += drive.imag
+        x *= self.kept
+        z *= self.kept
         if np.count_nonzero(spin):
             spin *= SPIN_KEPT
             np.minimum(np.maximum(spin, -MAX_SPIN, out=spin), MAX_SPIN, out=spin)
         landed = self._land()
 
-        boxes, velocity = self.outlines(), motion[0] + 1j * motion[1]
+        boxes, velocity = self.outlines(), (x + 1j * z).reshape(-1)
         # Who is hit may leave as fast as the fastest of its area came.
         speed = np.abs(velocity).reshape(self.yaw.shape).max(axis=1)
         reach = 2.0 * (speed * TICK_S + CONTACT_GAP)
         meeting = meet(boxes, near_pairs(boxes, self._pairs, reach.repeat(self._pairs_of_area)))
         contacts = joined(
             pair_contacts(meeting, velocity, self._turns),
-            wall_contacts(boxes, self.room, motion, self._turns),
+            wall_contacts(boxes, self.room, velocity, self._turns),
         )
-        solve(contacts, motion, self._weight, self._floor(landed))
+        solve(contacts, self._motion, self._weight, self._floor(landed))
 
-        self._centre += (motion[0] + 1j * motion[1]) * TICK_S
+        self._centre += (x + 1j * z).reshape(-1) * TICK_S
         turned = bool(np.count_nonzero(spin))
         if turned:
-            self.yaw += spin.reshape(self.yaw.shape) * TICK_S
+            self.yaw += spin * TICK_S
             boxes = self.outlines()
         self._separate(boxes, meeting, turned)
 
@@ -162,12 +164,13 @@ class SlidingBoxes:
         half = as_complex(self.half).reshape(-1)
         self._radius = np.abs(half)
         inertia = self._mass * self._radius**2 / 3.0
-        self._weight = np.array((1.0 / self._mass, 1.0 / self._mass, self._turns / inertia))
+        weight = np.array((1.0 / self._mass, 1.0 / self._mass, self._turns / inertia))
+        self._weight = np.moveaxis(weight.reshape(3, *self._systems), 0, -2)
         self._table[2], self._table[3] = half, swapped(half)
 
         # Spin by speed lost to the floor: the two friction anchors of a face stand in opposite corners.
         grip = self._mass * self._radius / inertia
-        self._grip = np.array((-grip, grip))
+        self._grip = np.array((-grip, grip)).reshape(2, *self._systems)
         self._is_sticky = bool((self.hold != self.rub).any())
 
     def _land(self) -> np.ndarray:
@@ -191,8 +194,8 @@ class SlidingBoxes:
 
     def _floor(self, landed: np.ndarray) -> Floor:
         """Return what the floor's friction can take in this tick."""
-        rub = np.maximum(self.rub * landed, 1e-12).reshape(-1)
-        hold = (self.hold * landed).reshape(-1) if self._is_sticky else rub
+        rub = np.maximum(self.rub * landed, 1e-12).reshape(self._systems)
+        hold = (self.hold * landed).reshape(self._systems) if self._is_sticky else rub
         return Floor(hold, rub, rub * self._grip)
 
     def _separate(self, boxes: Outlines, before: Meeting, turned: bool) -> None:
@@ -240,7 +243,7 @@ class SlidingBoxes:
         inside = np.minimum(np.maximum(boxes.place, low), high)
         out = (inside != boxes.place) & boxes.present[:, None]
         boxes.place[out] = inside[out]
-        self._motion[:2].T[out] = 0.0
+        self.motion[..., :2][out.reshape(self.place.shape)] = 0.0
 
 
 def _pairs(num_areas: int, bodies: int) -> np.ndarray:

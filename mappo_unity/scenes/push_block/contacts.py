@@ -151,13 +151,12 @@ def pair_contacts(meeting: Meeting, velocity: np.ndarray, turns: np.ndarray) -> 
     return Contacts(meeting.pairs.take(pair, axis=1), vectors, gap[end, pair])
 
 
-def wall_contacts(boxes: Outlines, room: Room, motion: np.ndarray, turns: np.ndarray) -> Contacts:
+def wall_contacts(boxes: Outlines, room: Room, velocity: np.ndarray, turns: np.ndarray) -> Contacts:
     """Return the contacts of boxes with the walls that they are near: their corners.
 
-    `motion` [3, M]: velocity (m/s; the spin is not looked at). `turns`: as in `pair_contacts`. Of a body that
-    contacts do not turn one point is enough.
+    `velocity`, `turns`: as in `pair_contacts`. Of a body that contacts do not turn one point is enough.
     """
-    gaps, reach = room.gaps(boxes), np.abs(motion[:2].T) * TICK_S + CONTACT_GAP
+    gaps, reach = room.gaps(boxes), np.abs(velocity.view(float).reshape(-1, 2)) * TICK_S + CONTACT_GAP
     body, axis = ((gaps < reach) & boxes.present[:, None]).nonzero()
     if not body.size:
         return _NO_CONTACTS

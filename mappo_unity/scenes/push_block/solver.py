@@ -5,12 +5,15 @@ the normal impulses of all contacts, then their friction, then the floor's frict
 have left. The floor's friction is part of the rounds, so that a heavy box stays where it is while the pushes
 against it are less than the floor can hold. Contacts of a body share its mass, so that their impulses cannot
 add up to too much.
-Legend: M bodies of all areas in a row, K contacts, T bodies that take part: all, or of many those that touch
-something.
+
+The bodies of a few areas make one system, which takes the fewest calls; of many areas each is a system of its
+own, so that the work grows only with their number. Arrays of one system have no axis G.
+Legend: M bodies of all areas in a row; G systems of B bodies each; K contacts, C the most of a system.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +23,7 @@ from mappo_unity.scenes.core.ground import BOX_FRICTION, TICK_S
 ROUNDS = 16
 HASTE = 1.2  # over-relaxation of the normal impulses; stable below 2, as bodies' masses are shared
 NEGLIGIBLE = 1e-2  # kg m/s: an impulse that ends the rounds
-FEW = 64  # so many bodies take part at once, whether they touch something or not
+FEW = 64  # bodies that make one system, at most
 WALL = -1  # instead of a body's number
 
 
@@ -40,98 +43,92 @@ class Floor(NamedTuple):
     """What the floor can take from bodies in a tick."""
 
     hold: np.ndarray
-    """[M], m/s: the most speed that friction stops entirely (static); `rub` itself where they are equal."""
+    """[G, B], m/s: the most speed that friction stops entirely (static); `rub` itself where it is equal."""
     rub: np.ndarray
-    """[M], m/s: what it takes from a faster body (dynamic); above 0."""
+    """[G, B], m/s: what it takes from a faster body (dynamic); above 0."""
     turn: np.ndarray
-    """[2, M], rad/s: the least and the most that it adds to the spin."""
+    """[2, G, B], rad/s: the least and the most that it adds to the spin."""
 
     def limited(self, change: np.ndarray) -> np.ndarray:
-        """Return what friction makes of a change of motion [3, M] (x, z, spin) that would stop it."""
-        (hold, rub, (least, most)), (x, z, spin) = self, change
-        speed = np.hypot(x, z)
+        """Return what friction makes of a change of motion [G, 3, B] (x, z, spin) that would stop it."""
+        hold, rub, (least, most) = self
+        speed = np.hypot(change[..., 0, :], change[..., 1, :])
         share = rub / np.maximum(speed, rub)
         if hold is not rub:
             share[speed <= hold] = 1.0
 
         limited = np.empty(change.shape)
-        np.multiply(change[:2], share, out=limited[:2])
-        np.minimum(np.maximum(spin, least), most, out=limited[2])
+        np.multiply(change[..., :2, :], share[..., None, :], out=limited[..., :2, :])
+        np.minimum(np.maximum(change[..., 2, :], least), most, out=limited[..., 2, :])
         return limited
+
+
+def systems_of(num_areas: int, bodies: int) -> tuple[int, ...]:
+    """Return the shape [G, B] of the systems that areas with so many bodies each make."""
+    return (num_areas * bodies,) if num_areas * bodies <= FEW else (num_areas, bodies)
 
 
 def solve(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Floor) -> None:
     """Stop bodies from approaching and rub, in place.
 
-    `motion` [3, M]: velocity along x and z (m/s) and spin (rad/s, clockwise from above); `weight` [3, M]:
-    inverse masses (1/kg) and inertia (1/(kg m^2)), of which the latter is 0 where contacts turn nothing.
+    `motion` [G, 3, B]: velocity along x and z (m/s) and spin (rad/s, clockwise from above); `weight`
+    [G, 3, B]: inverse masses (1/kg) and inertia (1/(kg m^2)), of which the latter is 0 where contacts turn
+    nothing.
     """
     if not contacts.gap.size:
         motion += floor.limited(-motion)
-    elif motion.shape[1] <= FEW:
-        _solve(contacts, motion, weight, floor)
-    else:
-        _solve_few(contacts, motion, weight, floor)
+        return
 
+    # A body's mass is shared by its contacts; walls are counted in front of the bodies.
+    share = np.bincount((contacts.bodies + 1).ravel(), minlength=floor.rub.size + 1)[1:]
+    shared = weight * share.reshape(*floor.rub.shape[:-1], 1, -1)
+    if motion.ndim > 2:
+        contacts = _by_system(contacts, floor.rub.shape)
 
-def _solve_few(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Floor) -> None:
-    """Let only bodies take part that touch something; on the others the floor acts alone."""
-    touches = np.zeros(motion.shape[1] + 1, bool)
-    touches[contacts.bodies] = True
-    touches[WALL] = False
-    bodies = touches.nonzero()[0]
-    number = np.full(len(touches), WALL)
-    number[bodies] = np.arange(len(bodies))
+    # `dot` takes half the time of `matmul` on arrays so small, but knows one system only.
+    times = np.dot if motion.ndim == 2 else np.matmul
+    rows = _rows(contacts, motion.shape[-1])
+    answers = rows * _in_a_row(weight)
 
-    few = motion.take(bodies, axis=1)
-    hold, rub, turn = (most.take(bodies, axis=-1) for most in floor)
-    held = Floor(rub if floor.hold is floor.rub else hold, rub, turn)
-    _solve(contacts._replace(bodies=number[contacts.bodies]), few, weight.take(bodies, axis=1), held)
-    motion += floor.limited(-motion)
-    motion[:, bodies] = few
-
-
-def _solve(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Floor) -> None:
-    """Do what `solve` does for contacts and bodies that all take part."""
-    count = motion.shape[1]
-    rows = _rows(contacts, count)
-    answers = rows * weight.ravel()
-
-    # Scaled by the masses at the contacts, rows turn motions into the impulses that would stop them. A body's
-    # mass is shared by its contacts; walls are counted in front of the bodies.
-    share = np.bincount((contacts.bodies + 1).ravel(), minlength=count + 1)[1:]
-    masses = 1.0 / (rows * rows).dot((weight * share).ravel())
+    # Scaled by the masses at the contacts, rows turn motions into the impulses that would stop them.
+    masses = 1.0 / np.maximum(times(rows * rows, _in_a_row(shared).swapaxes(-1, -2)), 1e-12)
     masses[0] *= HASTE
     masses[1] /= BOX_FRICTION  # so that friction is at most the normal impulse
-    rows *= masses[:, :, None]
+    rows *= masses
     answers[1] *= BOX_FRICTION
 
-    allowed = masses[0] * np.maximum(contacts.gap, 0.0) / TICK_S  # for approach that only closes a gap
-    _rounds(motion, rows, answers, allowed, floor)
+    # An approach that only closes a gap is not stopped.
+    allowed = masses[0, ..., 0] * np.maximum(contacts.gap, 0.0) / TICK_S
+    _rounds(motion, rows, answers, allowed[..., None, :], floor, times)
 
 
 def _rounds(
-    motion: np.ndarray, rows: np.ndarray, answers: np.ndarray, allowed: np.ndarray, floor: Floor
+    motion: np.ndarray,
+    rows: np.ndarray,
+    answers: np.ndarray,
+    allowed: np.ndarray,
+    floor: Floor,
+    times: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> None:
-    """Add what all impulses do to the motion [3, T].
+    """Add what all impulses do to the motion [G, 3, B].
 
-    `rows` [2, K, 3 T]: normal impulses by motion, and those of friction by its coefficient; `answers` [2, K,
-    3 T]: motion by either; `allowed` [K]: what normal impulses may lack, kg m/s.
+    `rows` [2, G, C, 3 B]: normal impulses by motion, and those of friction by its coefficient; `answers`
+    [2, G, C, 3 B]: motion by either; `allowed` [G, 1, C]: what normal impulses may lack, kg m/s.
     """
-    (along, across), (push, rub) = rows, answers  # `dot` takes half the time of `@` on arrays so small
-    flat = motion.reshape(-1)  # the motion itself, in a row
-    impulse = friction = np.zeros(len(along))
+    (along, across), (push, rub) = rows.swapaxes(-1, -2), answers
+    flat = _in_a_row(motion)  # the motion itself
+    impulse = friction = np.zeros(allowed.shape)
     held = np.zeros(motion.shape)  # what the floor has taken so far
 
     for _ in range(ROUNDS):
         # An impulse may shrink again in a later round, but it never pulls.
-        grown = np.maximum(impulse - along.dot(flat) - allowed, 0.0)
+        grown = np.maximum(impulse - times(flat, along) - allowed, 0.0)
         change = grown - impulse
         impulse = grown
-        flat += change.dot(push)
+        flat += times(change, push)
 
-        rubbed = np.minimum(np.maximum(friction - across.dot(flat), -impulse), impulse)
-        flat += (rubbed - friction).dot(rub)
+        rubbed = np.minimum(np.maximum(friction - times(flat, across), -impulse), impulse)
+        flat += times(rubbed - friction, rub)
         friction = rubbed
 
         stopping = held - motion
@@ -141,21 +138,44 @@ def _rounds(
             break
 
 
-def _rows(contacts: Contacts, count: int) -> np.ndarray:
-    """Return what turns motions of `count` bodies into speeds at contacts, along and across, [2, K, 3 T]."""
-    normal, arms = contacts.vectors[0], contacts.vectors[1:, None]
-
-    # Who takes part: 1 for the one, -1 for the other; walls, in the last column, are cut off.
-    part, each = np.zeros((2, len(normal), count + 1)), np.arange(len(normal))
-    part[0, each, contacts.bodies[0]], part[1, each, contacts.bodies[1]] = 1.0, -1.0
-    mine, theirs = part[:, :, :count]
+def _rows(contacts: Contacts, size: int) -> np.ndarray:
+    """Return what turns motions of B bodies into speeds at contacts, along and across, [2, G, C, 3 B]."""
+    normal, arms = contacts.vectors[0], contacts.vectors[1:]
+    mine, theirs = (contacts.bodies[..., None] == np.arange(size)).astype(float)  # walls match nobody
 
     # Speed of a point at an arm (r_x, r_z): v_x + spin * r_z, v_z - spin * r_x.
     way = np.array((normal, -1j * normal))
-    lever, other_lever = (way.conj() * arms).imag[..., None]
-    way = way[:, :, None]
-    rows, both = np.empty((2, len(normal), 3, count)), mine + theirs
-    np.multiply(way.real, both, out=rows[:, :, 0])
-    np.multiply(way.imag, both, out=rows[:, :, 1])
-    np.add(lever * mine, other_lever * theirs, out=rows[:, :, 2])
-    return rows.reshape(2, len(normal), 3 * count)
+    lever, other_lever = (way.conj() * arms[:, None]).imag[..., None]
+    way = way[..., None]
+    rows, both = np.empty((*way.shape[:-1], 3, size)), mine - theirs
+    np.multiply(way.real, both, out=rows[..., 0, :])
+    np.multiply(way.imag, both, out=rows[..., 1, :])
+    np.subtract(lever * mine, other_lever * theirs, out=rows[..., 2, :])
+    return rows.reshape(*way.shape[:-1], 3 * size)
+
+
+def _in_a_row(motion: np.ndarray) -> np.ndarray:
+    """Return a view [G, 1, 3 B] of something [G, 3, B]."""
+    return motion.reshape(*motion.shape[:-2], 1, -1)
+
+
+def _by_system(contacts: Contacts, shape: tuple[int, ...]) -> Contacts:
+    """Return the contacts of G systems of B bodies each, K being [G, C]: bodies numbered in their systems.
+
+    Places that a system does not need have two walls.
+    """
+    systems, size = shape
+    system = contacts.bodies[0] // size
+
+    # The place of each contact among those of its system.
+    order = np.argsort(system, kind="stable")
+    ordered = system[order]
+    place = np.empty_like(system)
+    place[order] = np.arange(len(system)) - np.searchsorted(ordered, ordered)
+    width = int(place.max()) + 1
+
+    bodies = np.full((2, systems, width), WALL)
+    vectors, gap = np.zeros((3, systems, width), complex), np.zeros((systems, width))
+    bodies[:, system, place] = np.where(contacts.bodies == WALL, WALL, contacts.bodies - system * size)
+    vectors[:, system, place], gap[system, place] = contacts.vectors, contacts.gap
+    return Contacts(bodies, vectors, gap)
