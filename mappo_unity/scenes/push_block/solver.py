@@ -7,7 +7,8 @@ against it are less than the floor can hold. Contacts of a body share its mass, 
 add up to too much.
 
 The bodies of a few areas make one system, which takes the fewest calls; of many areas each is a system of its
-own, so that the work grows only with their number. Arrays of one system have no axis G.
+own, so that the work grows only with their number. All take the rounds of the one that needs most. Arrays of
+one system have no axis G.
 Legend: M bodies of all areas in a row; G systems of B bodies each; K contacts, C the most of a system.
 """
 
