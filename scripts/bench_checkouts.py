@@ -29,14 +29,14 @@ import numpy as np
 from mlagents_envs.base_env import ActionTuple
 from bench_scenes import decisions_per_s, make_scene, random_policy
 
-draw, rng = random_policy(), np.random.default_rng(0)
+random, rng = random_policy(), np.random.default_rng(0)
 
 def forward(spec, decisions):
-    action = draw(spec, decisions)
-    ahead = rng.random((len(decisions), 1)) < {share}
+    action = random(spec, decisions)
+    ahead = rng.random((len(decisions), 1)) < {forward_share}
     return ActionTuple(action.continuous, np.where(ahead, 1, action.discrete))
 
-env, policy = make_scene({scene!r}, num_areas={num_areas}), forward if {share} else draw
+env, policy = make_scene({scene!r}, num_areas={num_areas}), {play}
 env.reset()
 for _ in range({warm_up}):  # leave the start
     decisions_per_s(env, policy, 0.01)
@@ -46,9 +46,11 @@ for _ in sys.stdin:
 WARM_UP = 20  # times at least 16 steps
 
 
-def stepper(checkout: Path, scene: str, num_areas: int, share: float) -> subprocess.Popen[str]:
+def stepper(checkout: Path, scene: str, num_areas: int, play: str) -> subprocess.Popen[str]:
     """Start a process that answers each line with the decisions a second of its checkout."""
-    program = STEPPER.format(scene=scene, num_areas=num_areas, share=share, warm_up=WARM_UP, turn=TURN_S)
+    program = STEPPER.format(
+        scene=scene, num_areas=num_areas, play=play, forward_share=FORWARD_SHARE, warm_up=WARM_UP, turn=TURN_S
+    )
     return subprocess.Popen(
         [sys.executable, "-c", program],
         cwd=checkout,
@@ -84,8 +86,8 @@ def main() -> None:
         parser.error(f"FOLDER={options.folder} must be a checkout: it has no scripts/bench_scenes.py")
 
     checkouts = Path(__file__).resolve().parent.parent, options.folder.resolve()
-    share = FORWARD_SHARE if options.forward else 0.0
-    here, other = (stepper(checkout, options.scene, options.num_areas, share) for checkout in checkouts)
+    play = "forward" if options.forward else "random"
+    here, other = (stepper(checkout, options.scene, options.num_areas, play) for checkout in checkouts)
     turns = [(rate(here), rate(other)) for _ in range(options.turns)]
     for process in (here, other):
         process.terminate()
@@ -93,7 +95,6 @@ def main() -> None:
     for checkout, rates in zip(checkouts, zip(*turns, strict=True), strict=True):
         print(f"{statistics.median(rates):>10,.0f} decisions/s  {checkout}")
     ratio = statistics.median(mine / theirs for mine, theirs in turns)
-    play = "forward" if options.forward else "random"
     print(f"{ratio:>10.2f} times as fast ({options.scene}, {options.num_areas} areas, {play} play)")
 
 
