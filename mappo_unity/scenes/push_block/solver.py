@@ -91,8 +91,8 @@ def solve(contacts: Contacts, motion: np.ndarray, weight: np.ndarray, floor: Flo
     rows = _rows(contacts, motion.shape[-1])
     answers = rows * _in_a_row(weight)
 
-    # Scaled by the masses at the contacts, rows turn motions into the impulses that would stop them. Places of a
-    # system without a contact have nothing to weigh.
+    # Scaled by the masses at the contacts, rows turn motions into the impulses that would stop them. Places
+    # of a system without a contact have nothing to weigh.
     masses = 1.0 / np.maximum(times(rows * rows, _in_a_row(shared).swapaxes(-1, -2)), 1e-12)
     masses[0] *= HASTE
     masses[1] /= BOX_FRICTION  # so that friction is at most the normal impulse
