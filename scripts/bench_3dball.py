@@ -19,6 +19,7 @@ from pathlib import Path
 import torch
 from bench_update import measure, timed
 from mlagents_envs.base_env import ActionTuple
+from run_script import run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
@@ -125,4 +126,4 @@ class BareLoop:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

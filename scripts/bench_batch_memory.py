@@ -18,6 +18,7 @@ import tempfile
 from pathlib import Path
 
 import torch
+from run_script import run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.training.memory import show_size
@@ -34,7 +35,11 @@ def main() -> None:
     )
     parser.add_argument("scenes", nargs="*", default=["GridFoodCollector", "SoccerTwos"])
 
-    for scene in parser.parse_args().scenes:
+    scenes = parser.parse_args().scenes
+    for scene in scenes:
+        compose_config([f"env={scene}"])  # says what is wrong with a name
+
+    for scene in scenes:
         # spawned: what another process has held counts in a forked one's peak
         process = multiprocessing.get_context("spawn").Process(target=measure, args=(scene,))
         process.start()
@@ -74,4 +79,4 @@ def peak() -> int:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

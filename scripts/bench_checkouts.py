@@ -20,6 +20,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from run_script import run_script
+
+from mappo_unity.scenes.registry import BUILT_IN
+
 TURN_S = 0.06
 FORWARD_SHARE = 0.75
 STEPPER = """
@@ -84,6 +88,8 @@ def main() -> None:
     options = parser.parse_args()
     if not (options.folder / "scripts" / "bench_scenes.py").is_file():
         parser.error(f"FOLDER={options.folder} must be a checkout: it has no scripts/bench_scenes.py")
+    if options.scene not in BUILT_IN:
+        parser.error(f"--scene {options.scene}: there is no such scene; there are {', '.join(BUILT_IN)}")
 
     checkouts = Path(__file__).resolve().parent.parent, options.folder.resolve()
     play = "forward" if options.forward else "random"
@@ -99,4 +105,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

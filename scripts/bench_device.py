@@ -21,6 +21,7 @@ from pathlib import Path
 import torch
 from bench_scaling import ENDLESS, WARM_UP
 from rich.console import Console
+from run_script import run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.errors import ConfigError
@@ -88,4 +89,4 @@ def measure(options: list[str], iterations: int) -> tuple[float, float, float]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

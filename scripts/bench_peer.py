@@ -22,7 +22,6 @@ import csv
 import os
 import shlex
 import shutil
-import socket
 import statistics
 import subprocess
 import sys
@@ -31,18 +30,14 @@ from pathlib import Path
 from typing import Any
 
 from learn_scene import append, results
+from peer_command import add_peer_options, check_peer_options, their_command
+from recorded_player import ROOT, make_player
+from run_script import run_script
 
-ROOT = Path(__file__).resolve().parents[1]
 TRAINERS = "mlagents-learn", "mappo-unity"
 COLORS = "tab:orange", "tab:blue"
 BINS = 12  # points of a curve
 LAST = 0.1  # share of a run whose episodes make its last return
-CONFIGURATIONS = {
-    "CooperativePushBlock": "PushBlockCollab",
-    "GridFoodCollector": "FoodCollector",
-    "Pyramids": "PyramidsRND",
-}
-"""Official files of another name than the scene's; of two for Pyramids the one with the preset's novelty."""
 
 
 def main() -> None:
@@ -50,20 +45,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--peer", type=Path, help="the mlagents-learn to compare with")
-    parser.add_argument("--official", type=Path, help="ML-Agents' folder config/, with ppo/ and poca/")
+    add_peer_options(parser)
     parser.add_argument("--scenes", nargs="+", default=["3DBall", "Basic", "DungeonEscape", "Hallway"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--trainers", nargs="+", choices=TRAINERS, default=TRAINERS)
     parser.add_argument("--steps", type=int, default=300_000, help="agent decisions of a run")
     parser.add_argument("--out", type=Path, default=Path("outputs/peer"))
-    parser.add_argument("--draw", action="store_true", help="run nothing")
     parser.add_argument("options", nargs="*", help="further options of mappo-train")
     arguments = parser.parse_intermixed_args()
+    check_peer_options(arguments, arguments.scenes)
 
     if not arguments.draw:
-        if arguments.peer is None or arguments.official is None:
-            parser.error("--peer and --official are needed to run anything (--draw runs nothing)")
         for scene in arguments.scenes:
             for seed in arguments.seeds:
                 for trainer in arguments.trainers:
@@ -113,95 +105,11 @@ def run(arguments: argparse.Namespace, scene: str, seed: int, trainer: str) -> N
     print(row, flush=True)
 
 
-def make_player(scene: str, folder: Path) -> Path:
-    """Write an executable that plays the scene and notes its episodes; return its path."""
-    path = folder / f"{scene}.x86_64"
-    words = [
-        "env",
-        f"PYTHONPATH={os.pathsep.join([str(ROOT / 'scripts'), str(ROOT)])}",
-        f"PEER_SCENE={scene}",
-        f"PEER_EPISODES={folder / 'episodes.csv'}",
-        *[sys.executable, "-m", "mappo_unity.player", "bench_peer:recorded_scene"],
-    ]
-    path.write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n')
-    path.chmod(0o755)
-    return path
-
-
 def our_command(scene: str, seed: int, steps: int, player: Path, folder: Path) -> list[Any]:
     """Return the command line of mappo-train."""
     recipe = ["recipe=mlagents", f"env={scene}", "env.backend=player", f"env.file_name={player}"]
     run_ = [f"seed={seed}", f"max_steps={steps}", "env.no_graphics=true", f"hydra.run.dir={folder / 'run'}"]
     return [Path(sys.executable).parent / "mappo-train", *recipe, *run_, "matches.interval=null"]
-
-
-def their_command(
-    arguments: argparse.Namespace, scene: str, seed: int, steps: int | None, player: Path, folder: Path
-) -> list[Any]:
-    """Return the command line of mlagents-learn, with the official configuration but for max_steps.
-
-    `steps` takes that one's place; with None it stays, too.
-    """
-    import yaml
-
-    name = CONFIGURATIONS.get(scene, scene)
-    (official,) = arguments.official.glob(f"p*/{name}.yaml")  # ppo/ or poca/
-    configuration = yaml.safe_load(official.read_text())
-    for behavior in configuration["behaviors"].values() if steps is not None else ():
-        behavior["max_steps"] = steps
-    path = folder / "configuration.yaml"
-    path.write_text(yaml.safe_dump(configuration))
-
-    with socket.socket() as probe:  # a port that nobody uses
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    place = ["--results-dir", folder, "--run-id", "run", "--base-port", port, "--no-graphics"]
-    return [*map(str, [arguments.peer, path, "--env", player, "--seed", seed, *place])]
-
-
-def recorded_scene(seed: int = 0) -> Any:
-    """Return the scene PEER_SCENE, which notes its episodes in the file PEER_EPISODES; Unity's areas."""
-    from mappo_unity.scenes import make_scene
-
-    env = make_scene(os.environ["PEER_SCENE"], seed=seed)
-    notes = Episodes(env, Path(os.environ["PEER_EPISODES"]))
-    env.step, env.reset = notes.step, notes.reset  # type: ignore[method-assign]
-    return env
-
-
-class Episodes:
-    """Write a line for each episode of a BaseEnv: decisions so far, own and group return, seconds (Unix)."""
-
-    def __init__(self, env: Any, path: Path) -> None:
-        self._env, self._step, self._reset = env, env.step, env.reset
-        self._decisions = 0
-        self._file = open(path, "w", buffering=1)
-        self._earned: dict[int, tuple[float, float]] = {}
-
-    def step(self) -> None:
-        """Step the environment and note what it paid."""
-        self._step()
-        self._note()
-
-    def reset(self) -> None:
-        """Reset the environment; episodes under way are forgotten."""
-        self._reset()
-        self._earned.clear()
-        self._note()
-
-    def _note(self) -> None:
-        for name in self._env.behavior_specs:
-            decision, terminal = self._env.get_steps(name)
-            for steps in (terminal, decision):
-                columns = steps.agent_id, steps.reward, steps.group_reward
-                for agent, reward, group_reward in zip(*(column.tolist() for column in columns)):
-                    own, group = self._earned.get(agent, (0.0, 0.0))
-                    self._earned[agent] = own + reward, group + group_reward
-                if steps is terminal:
-                    for agent in steps.agent_id.tolist():
-                        own, group = self._earned.pop(agent)
-                        self._file.write(f"{self._decisions},{own:.6g},{group:.6g},{time.time():.2f}\n")
-            self._decisions += len(decision)
 
 
 def episodes(folder: Path) -> list[tuple[int, float]]:
@@ -309,4 +217,4 @@ def draw(curves: Curves, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

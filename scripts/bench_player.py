@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from run_script import run_script
 
 from mappo_unity.cli.player import run as player_main
 from mappo_unity.config.compose import compose_config
@@ -366,4 +367,4 @@ def median_ratio(above: list[float], below: list[float]) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

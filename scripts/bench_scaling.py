@@ -21,6 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
+from run_script import run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.errors import ConfigError
@@ -49,6 +50,8 @@ def main() -> None:
     arguments = parser.parse_args()
 
     variants = variants_of(arguments.workers, arguments.learners)
+    for scene in arguments.scenes:  # below, options that do not go together are left out
+        compose_config([f"env={scene}", *arguments.option])
 
     print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores")
     for scene in arguments.scenes:
@@ -107,4 +110,4 @@ def print_table(scene: str, rates: dict[str, list[float]]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

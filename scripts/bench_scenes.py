@@ -24,6 +24,7 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import numpy as np  # noqa: E402
 from mlagents_envs.base_env import ActionSpec, ActionTuple, BaseEnv, BehaviorSpec, DecisionSteps  # noqa: E402
 from omegaconf import OmegaConf  # noqa: E402
+from run_script import run_script  # noqa: E402
 
 from mappo_unity.config.presets import conf_dir  # noqa: E402
 from mappo_unity.scenes import make_scene, scene_names  # noqa: E402
@@ -123,4 +124,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

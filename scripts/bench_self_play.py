@@ -19,6 +19,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from run_script import run_script
+
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
 from mappo_unity.training.collection.fleet import Batches
@@ -87,4 +89,4 @@ def iterate(state: RunState, batches: Batches) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from run_script import run_script
 from torch import Tensor, nn
 from torch.distributions import Categorical, Normal
 
@@ -150,4 +151,4 @@ def timed(work: Callable[[], Any]) -> float:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    main()
+    run_script(main)

@@ -20,6 +20,8 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
+from run_script import run_script
+
 HERE = Path(__file__).resolve().parents[1]
 CODE = "import sys; from mappo_unity.cli import play_main; sys.exit(play_main(sys.argv[1:]))"
 
@@ -56,8 +58,7 @@ def make_video(checkout: Path, scene: str, seconds: float, width: int, height: i
             text=True,
         )
         after = os.times()
-        if run.returncode:
-            sys.exit(run.stderr)
+        run.check_returncode()
         frames = re.search(r"(\d+) frames", run.stdout)
         assert frames, run.stdout
         cost_s = after.children_user + after.children_system - before.children_user - before.children_system
@@ -108,4 +109,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from run_script import run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
@@ -174,4 +175,4 @@ class Run:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

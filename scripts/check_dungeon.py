@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from run_script import run_script
 
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.scenes.core.ground import TICK_S
@@ -95,4 +96,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -33,6 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from run_script import run_script
 
 from mappo_unity.envs.backends import MakeEnv, make_env_function
 from mappo_unity.errors import ConfigError
@@ -201,4 +202,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main)

@@ -13,6 +13,7 @@ import argparse
 from pathlib import Path
 
 import torch
+from run_script import run_script
 
 from mappo_unity.policies.matches import find_sides, play_side
 from mappo_unity.policies.policy import CheckpointPolicy, Policy
@@ -56,4 +57,4 @@ def play(strikers: Policy, goalie: Policy, matches: int, seed: int) -> tuple[flo
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -17,6 +17,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from run_script import run_script
+
 ROOT = Path(__file__).resolve().parents[1]
 RUN = ("env=Basic", "max_steps=4000")
 HEAD = ("Python", "pip", "install s", "train s", "torch", "result")
@@ -98,4 +100,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main)

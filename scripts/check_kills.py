@@ -19,6 +19,7 @@ import threading
 from pathlib import Path
 
 from learn_scene import mappo_eval
+from run_script import run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.runs.folder import write_record
@@ -121,4 +122,4 @@ def is_alive(pid: int) -> bool:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

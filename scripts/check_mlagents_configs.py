@@ -17,6 +17,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from run_script import run_script
+
 from mappo_unity.cli import learn_main
 from mappo_unity.scenes.registry import scene_names
 
@@ -42,6 +44,8 @@ def main() -> None:
     arguments = parser.parse_args()
 
     files = sorted(arguments.config.resolve().rglob("*.yaml"))
+    if not files:
+        parser.error(f"{arguments.config} does not exist, or has no .yaml file")
     demos = arguments.demos.resolve() if arguments.demos else None
     print("| file | outcome | what was said |\n|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
@@ -93,4 +97,4 @@ def call(arguments: list[str]) -> tuple[int, str, str]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -17,6 +17,7 @@ import os
 from pathlib import Path
 
 from learn_scene import mappo_eval
+from run_script import run_script
 from score_measures import as_strikers
 from score_table import train
 
@@ -61,4 +62,4 @@ def report(label: str, policy: list[str], matches: int) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 from learn_scene import HERE, mappo_eval
+from run_script import run_script
 
 BALLS = [
     (mass, scale) for mass in (0.5, 1, 10) for scale in (0.75, 1, 3)
@@ -60,4 +61,4 @@ def evaluate(run: Path, mass: float, scale: float, episodes: int) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

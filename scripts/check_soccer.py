@@ -25,6 +25,7 @@ import mappo_unity.protocol.protobuf
 mappo_unity.protocol.protobuf.install()
 
 from mlagents_envs.base_env import ActionTuple  # noqa: E402
+from run_script import run_script  # noqa: E402
 
 from mappo_unity.scenes import make_scene  # noqa: E402
 
@@ -153,4 +154,4 @@ def shared_folder() -> Path:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -12,10 +12,10 @@ size) and memory, as a training run with init_from= says it. Exit code 1 if a fi
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from mlagents_envs.base_env import BehaviorSpec
+from run_script import run_script
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.keys import policy_name
@@ -78,4 +78,4 @@ def compare(path: Path, spec: BehaviorSpec) -> tuple[str, float]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main)

@@ -19,6 +19,7 @@ import tempfile
 from pathlib import Path
 
 from learn_scene import HERE, mappo_eval
+from run_script import run_script
 
 from mappo_unity.protocol.demos.reader import read_demo
 
@@ -77,4 +78,4 @@ def evaluate(folder: Path, episodes: int, options: list[str]) -> tuple[float, fl
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

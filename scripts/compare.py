@@ -16,6 +16,8 @@ import statistics
 import tempfile
 from pathlib import Path
 
+from run_script import run_script
+
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
 from mappo_unity.envs.backends import make_env_function
@@ -98,4 +100,4 @@ def play(cfg: Config, setup: TrainingSetup, count: int) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 from decisions_to import last_lessons, settled, with_value
 from learn_scene import append, mappo_eval, read_rows, thin
+from run_script import run_script
 from score_measures import measures_of
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import last_lesson, train
@@ -266,4 +267,4 @@ def draw(scene: str, curves: Curves) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from decisions_to import Metrics, columns_of, in_last_lesson, reached_cells, with_value
 from learn_scene import append, mappo_eval, read_rows
+from run_script import run_script
 from score_measures import behavior_return
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
@@ -150,4 +151,4 @@ def cells(row: dict[str, str]) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from decisions_to import columns_of, first_at, reached_cells
 from learn_scene import append, mappo_eval, read_rows
+from run_script import run_script
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
 
@@ -187,4 +188,4 @@ def cells(rows: list[dict[str, str]]) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

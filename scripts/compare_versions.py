@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from learn_scene import append, mappo_eval, results
+from run_script import run_script
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAIN = "import sys; from mappo_unity.cli import train_main; sys.exit(train_main())"
@@ -42,6 +43,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=400, help="episodes or matches of an evaluation")
     parser.add_argument("--out", type=Path, default=Path("outputs/versions"))
     arguments = parser.parse_args()
+    if not (arguments.before / "mappo_unity").is_dir():
+        parser.error(f"{arguments.before} must be a checkout: it has no mappo_unity/")
 
     out = arguments.out.resolve()
     for scene in arguments.scenes:
@@ -122,4 +125,4 @@ def table(rows: list[dict[str, str]]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

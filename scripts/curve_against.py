@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 from learn_scene import append
+from run_script import run_script
 
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.evaluate import open_policy
@@ -37,6 +38,9 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1_000_000, help="decisions between two points")
     parser.add_argument("--out", type=Path, default=Path("curve.csv"))
     arguments = parser.parse_args()
+    for run in arguments.runs:
+        if not checkpoints_in(run):
+            parser.error(f"{run} does not exist, or has no checkpoints")
 
     for run in arguments.runs:
         due = 0
@@ -80,4 +84,4 @@ def minutes_until(run: Path, steps: int) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from run_script import run_script
+
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.episodes import play, summarize
 from mappo_unity.policies.evaluate import open_policy
@@ -60,4 +62,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

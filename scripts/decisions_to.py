@@ -17,6 +17,8 @@ import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from run_script import run_script
+
 from mappo_unity.config.compose import load_config
 from mappo_unity.config.parameters.values import curricula
 from mappo_unity.runs.metrics_csv import read_metrics
@@ -36,6 +38,9 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     parser.add_argument("--metric", default="return_mean", help="column of metrics.csv")
     arguments = parser.parse_args()
+    for given in arguments.runs:
+        if not any(given.rglob("metrics.csv")):
+            parser.error(f"{given} does not exist, or holds no run")
 
     print(f"| run | decisions to {arguments.goal:g} | minutes | best | last | decisions |")
     print("|---|---|---|---|---|---|")
@@ -121,4 +126,4 @@ def row(run: Path, goal: float, metric: str) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -14,6 +14,7 @@ import subprocess
 from pathlib import Path
 
 from learn_scene import HERE
+from run_script import run_script
 from score_table import has_policies
 
 from mappo_unity.policies.policy_files import ZOO_FOLDER
@@ -49,4 +50,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

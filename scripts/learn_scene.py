@@ -22,6 +22,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from run_script import run_script
+
 from mappo_unity.runs.checkpoint_file import checkpoints_in
 from mappo_unity.runs.metrics_csv import read_metrics
 
@@ -124,4 +126,4 @@ def append(path: Path, row: dict[str, object]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

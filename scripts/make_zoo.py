@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from learn_scene import mappo_eval, read_rows
+from run_script import run_script
 from score_measures import measures_of
 
 from mappo_unity.config.compose import load_config
@@ -131,4 +132,4 @@ def write(cards: list[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

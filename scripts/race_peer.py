@@ -28,8 +28,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bench_peer import ROOT, make_player, their_command
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
+from peer_command import add_peer_options, check_peer_options, their_command
+from recorded_player import ROOT, make_player
+from run_script import run_script
 from score_measures import share_won
 from score_page import put_between
 
@@ -61,25 +63,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--peer", type=Path)
-    parser.add_argument("--official", type=Path, help="ML-Agents' folder config/, with ppo/ and poca/")
-    parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE=MINUTES")
+    add_peer_options(parser)
+    parser.add_argument("--scenes", type=minutes_of, nargs="+", default=[], metavar="SCENE=MINUTES")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--out", type=Path, default=Path("outputs/race"))
-    parser.add_argument("--draw", action="store_true", help="run nothing")
     arguments = parser.parse_args()
+    if arguments.scenes:
+        check_peer_options(arguments, [scene for scene, _ in arguments.scenes])
 
-    for word in [] if arguments.draw else arguments.scenes:
-        scene, _, minutes = word.partition("=")
+    for scene, minutes in [] if arguments.draw else arguments.scenes:
         for seed in arguments.seeds:
             # who begins changes, as the machine's load does
             order = [PEER, PLAYER, EMBEDDED] if seed % 2 == 0 else [EMBEDDED, PLAYER, PEER]
             for who in order:
-                race(arguments, scene, seed, who, 60 * float(minutes))
+                race(arguments, scene, seed, who, 60 * minutes)
             if scene in COMPETITIVE:
-                play_matches(arguments, scene, seed, float(minutes))
+                play_matches(arguments, scene, seed, minutes)
 
     write_page()
+
+
+def minutes_of(word: str) -> tuple[str, float]:
+    """Return the scene and the minutes of SCENE=MINUTES; raises ValueError."""
+    scene, _, minutes = word.partition("=")
+    return scene, float(minutes)
 
 
 def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s: float) -> None:
@@ -312,4 +319,4 @@ def draw(runs: dict[tuple[str, str], dict[str, list[dict[str, str]]]]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -17,6 +17,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from run_script import run_script
+
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path.insert(0, str(TESTS))
 faulty_env = importlib.import_module("faulty_env")
@@ -40,6 +42,9 @@ def main() -> None:
     wanted = {"": ""} | faulty_env.IN_THE_GAME
     wanted |= {fault: kind for fault, (kind, _) in faulty_env.IN_THE_OPTIONS.items()}
     names = arguments.faults or list(wanted)
+    for name in names:
+        if name not in wanted:
+            parser.error(f"{name}: there is no such fault; there are {', '.join(filter(None, wanted))}")
 
     found = 0
     os.chdir(TESTS)  # env.factory is looked for there
@@ -73,4 +78,4 @@ def findings(folder: Path) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

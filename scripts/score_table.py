@@ -24,6 +24,7 @@ from typing import Any
 
 from decisions_to import read_last_lesson, with_value
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
+from run_script import run_script
 from score_measures import MEASURES, Measure, measures_of
 from score_page import CURVES, SCORES, write_page
 
@@ -227,4 +228,4 @@ def append_curve(measure: Measure, seed: int, metrics: list[dict[str, int | floa
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

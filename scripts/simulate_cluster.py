@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from run_script import run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.training.collection.fleet import weights_of
@@ -131,4 +132,4 @@ def simulate(
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -26,6 +26,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from run_script import run_script
+
 HANG_TIMEOUT_S = 5.0
 
 
@@ -57,6 +59,9 @@ def main() -> int:
         trainer = start(folder, arguments, len(plan))
         done = disturb(trainer, plan, arguments.every_s, rng)
         code = trainer.wait()
+        if not (folder / "run" / "metrics.csv").exists():  # it ended before it began, and has said why
+            return code or 1
+
         print(f"troubles: {dict(Counter(signal.Signals(number).name for number in done))}")
         return report(folder / "run", code, len(done))
 
@@ -163,4 +168,4 @@ def serve(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(serve(sys.argv[2:]) if sys.argv[1:2] == ["serve"] else main())
+    run_script(main if sys.argv[1:2] != ["serve"] else lambda: serve(sys.argv[2:]))

@@ -32,6 +32,7 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps  # noqa: E402
+from run_script import run_script  # noqa: E402
 from scene_ranges.ranges import Seen  # noqa: E402
 
 from mappo_unity.scenes import make_scene  # noqa: E402
@@ -222,4 +223,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_script(main)

@@ -6,8 +6,8 @@ python scripts/wrap_docs.py README.md   # these files
 
 from __future__ import annotations
 
+import argparse
 import re
-import sys
 import textwrap
 from pathlib import Path
 
@@ -74,9 +74,18 @@ def _break(words: str, width: int, first: str, later: str) -> list[str]:
     return [line.replace("\0", " ") for line in lines]
 
 
-def main(names: list[str]) -> None:
-    """Wrap these files, or all of the checkout; print those that changed."""
-    paths = [Path(name) for name in names] or [
+def main() -> None:
+    """Wrap the files that are named, or all of the checkout; print those that changed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("files", nargs="*", type=Path, metavar="FILE")
+    paths = parser.parse_args().files
+    for path in paths:
+        if not path.is_file():
+            parser.error(f"{path} does not exist, or is not a file")
+
+    paths = paths or [
         *ROOT.glob("*.md"),
         *(ROOT / "docs").rglob("*.md"),
         *(ROOT / "mappo_unity").rglob("*.md"),
@@ -90,4 +99,4 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -9,6 +9,7 @@ Only for a change that is meant to change training; say in the commit what and w
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -16,14 +17,25 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import golden_runs
+from run_script import run_script
 
 
 def main() -> None:
     """Write the runs that the command line names."""
-    for name in sys.argv[1:] or [*golden_runs.RUNS, "resume"]:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", nargs="*", metavar="RUN")
+    every = [*golden_runs.RUNS, "resume"]
+    names = parser.parse_args().runs or every
+    for name in names:
+        if name not in every:
+            parser.error(f"{name}: there is no such run; there are {', '.join(every)}")
+
+    for name in names:
         with tempfile.TemporaryDirectory() as folder:
             print(golden_runs.write(name, Path(folder) / "run"))
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

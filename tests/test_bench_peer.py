@@ -14,13 +14,14 @@ from mappo_unity.envs.unity_env import UnityEnv
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 import bench_peer
+from recorded_player import recorded_scene
 
 
 def test_the_player_counts_returns_as_the_trainer_does(tmp_path, monkeypatch):
     monkeypatch.setenv("PEER_SCENE", "DungeonEscape")
     monkeypatch.setenv("PEER_EPISODES", str(tmp_path / "episodes.csv"))
     torch.manual_seed(0)
-    env = UnityEnv(lambda seed: bench_peer.recorded_scene(seed))
+    env = UnityEnv(recorded_scene)
     env.rollout(400, break_when_any_done=False)
     seen = [episode for episodes in env.pop_episodes().values() for episode in episodes]
     env.close()
@@ -53,13 +54,6 @@ def test_curves_and_table(tmp_path):
     assert (
         bench_peer.table(tmp_path).splitlines()[2] == "| Basic | 300 | 0 | 1.5 | 1.5 | 7 | 7 | 1.0 to 2.0 |"
     )
-
-
-def test_nothing_runs_without_the_peer(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["bench_peer.py", "--scenes", "Basic"])
-    with pytest.raises(SystemExit) as ended:
-        bench_peer.main()
-    assert ended.value.code == 2 and "--peer and --official are needed" in capsys.readouterr().err
 
 
 def test_the_picture_says_what_it_needs(tmp_path, monkeypatch):

@@ -12,8 +12,8 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
-import bench_peer
 import race_peer
+from peer_command import their_command
 
 
 @pytest.fixture
@@ -69,6 +69,6 @@ def test_pyramids_is_raced_with_the_official_rnd(tmp_path):
         (tmp_path / "ppo").mkdir(exist_ok=True)
         (tmp_path / "ppo" / f"{name}.yaml").write_text(yaml.safe_dump({"behaviors": {name: {}}}))
     arguments = argparse.Namespace(official=tmp_path, peer=Path("mlagents-learn"))
-    bench_peer.their_command(arguments, "Pyramids", 0, 1000, tmp_path / "player", tmp_path)
+    their_command(arguments, "Pyramids", 0, 1000, tmp_path / "player", tmp_path)
     configuration = yaml.safe_load((tmp_path / "configuration.yaml").read_text())
     assert configuration == {"behaviors": {"PyramidsRND": {"max_steps": 1000}}}

@@ -1,0 +1,119 @@
+"""scripts/: each says what it is for, and a mistake of its user is one line and exit code 2."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mappo_unity.errors import ConfigError, EnvironmentFailure
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+
+from run_script import run_script
+
+SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+COMMANDS = sorted(path.name for path in SCRIPTS.glob("*.py") if "__main__" in path.read_text())
+PEER = "--peer mlagents-learn --official ."
+NO_SCENE = "there is no embedded scene 'Nope'"
+
+MISTAKES = [
+    ("bench_batch_memory.py Nope", "env=Nope does not exist"),
+    ("bench_checkouts.py nowhere", "FOLDER=nowhere must be a checkout"),
+    (f"bench_checkouts.py {SCRIPTS.parent} --scene Nope", "Nope: there is no such scene"),
+    ("bench_peer.py --scenes Basic", "--peer and --official are needed"),
+    (f"bench_peer.py --scenes Nope {PEER}", "Nope: there is no such scene"),
+    (f"bench_peer.py --scenes Pyramids {PEER}", "--official=. has no ppo/PyramidsRND.yaml"),
+    ("bench_scaling.py Nope", "env=Nope does not exist"),
+    ("bench_scenes.py Nope", NO_SCENE),
+    ("bench_self_play.py Nope", "env=Nope does not exist"),
+    ("bench_update.py Nope", "env=Nope does not exist"),
+    ("check_dungeon.py --policy nowhere", "policy=nowhere does not exist"),
+    ("check_export.py nowhere --run-policy nowhere.py", "run_policy.py is not at nowhere.py"),
+    ("check_goalie.py nowhere", "nowhere does not exist"),
+    ("check_mlagents_configs.py nowhere", "nowhere does not exist"),
+    ("check_warm_starts.py nowhere", "there is no .onnx file"),
+    ("clone_demos.py nowhere", "does not exist"),
+    ("compare_critics.py Nope", "Nope: critics are compared in"),
+    ("compare_versions.py nowhere", "nowhere must be a checkout"),
+    ("curve_against.py random nowhere", "nowhere does not exist"),
+    ("curve_spread.py nowhere", "run=nowhere does not exist"),
+    ("decisions_to.py 1 nowhere", "nowhere does not exist"),
+    ("decisions_to.py much nowhere", "invalid float value: 'much'"),
+    ("draw_scenes.py Nope", "Nope: there is no such scene"),
+    ("make_zoo.py nowhere", "nowhere/config.yaml cannot be read"),
+    ("race_peer.py --scenes Basic=1", "--peer and --official are needed"),
+    ("race_peer.py --scenes Basic", "invalid minutes_of value: 'Basic'"),
+    ("score_doctor.py nowhere", "nowhere: there is no such fault"),
+    ("score_table.py Nope", "Nope: there is no such scene"),
+    ("soak_scenes.py --scenes Nope", "invalid choice: 'Nope'"),
+    ("wrap_docs.py nowhere", "nowhere does not exist"),
+    ("write_golden.py nowhere", "nowhere: there is no such run"),
+]
+
+
+def run(words: str, monkeypatch: pytest.MonkeyPatch) -> int | str | None:
+    """Run a script of scripts/ in this process; return its exit code."""
+    name, *arguments = words.split()
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(SCRIPTS / name), run_name="__main__")
+    return ended.value.code
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_script_says_what_it_is_for(name, monkeypatch, capsys):
+    assert run(f"{name} --help", monkeypatch) == 0
+    assert "usage:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("words", "said"), MISTAKES, ids=[words.split()[0] for words, _ in MISTAKES])
+def test_a_mistake_is_said_in_a_line(words, said, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert run(words, monkeypatch) == 2
+    err = capsys.readouterr().err
+    assert said in err and "Traceback" not in err
+    assert not list(tmp_path.iterdir()), "nothing is begun"
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "said"),
+    [
+        (ConfigError("a=1 must be 2"), 2, "a.py: a=1 must be 2"),
+        (EnvironmentFailure("it died"), 3, "a.py: it died"),
+        (KeyboardInterrupt(), 130, "a.py: interrupted"),
+        (
+            subprocess.CalledProcessError(2, ["bin/mappo-eval"], stderr="why\n"),
+            2,
+            "why\na.py: mappo-eval ended with exit code 2",
+        ),
+        (subprocess.CalledProcessError(-9, ["mappo-train"]), 1, "a.py: mappo-train ended with exit code -9"),
+    ],
+)
+def test_what_is_raised_becomes_an_exit_code(raised, code, said, monkeypatch, capsys):
+    def main() -> None:
+        raise raised
+
+    monkeypatch.setattr(sys, "argv", ["scripts/a.py"])
+    with pytest.raises(SystemExit) as ended:
+        run_script(main)
+    assert ended.value.code == code
+    assert capsys.readouterr().err == said + "\n"
+
+
+@pytest.mark.parametrize(("returned", "code"), [(None, None), (0, 0), (1, 1)])
+def test_what_is_returned_is_the_exit_code(returned, code):
+    with pytest.raises(SystemExit) as ended:
+        run_script(lambda: returned)
+    assert ended.value.code == code
+
+
+def test_a_mistake_of_a_programmer_keeps_its_traceback():
+    def main() -> None:
+        raise KeyError("x")
+
+    with pytest.raises(KeyError):
+        run_script(main)
