@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -64,9 +65,13 @@ class RecentEpisodes:
         counts = not self.early and len(self._rows()) >= self.size
         return self.summary()["return_mean"] if counts else -math.inf
 
-    def standard_error(self) -> float:
-        """Return that of the mean return, 0 of no episodes; team mates, who earn the same, count each."""
-        count = len(self._rows())
+    def standard_error(self, team_sizes: Mapping[str, int]) -> float:
+        """Return that of the mean return, 0 of no episodes; a team earns much the same and counts once.
+
+        Args:
+            team_sizes: agents of a team of each behavior.
+        """
+        count = sum(len(rows) / team_sizes[behavior] for behavior, rows in self.recent.items())
         return self.summary()["return_std"] / math.sqrt(count) if count else 0.0
 
     def summary(self) -> dict[str, float]:

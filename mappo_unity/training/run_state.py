@@ -201,8 +201,10 @@ class RunState:
         """
         if self.matches.two_sided and not self.cfg.bc.only:
             return self.matches.is_best(self.agent_steps)
+
+        team_sizes = {name: behavior.slots.team_size for name, behavior in self.setup.env.behaviors.items()}
         # while too few episodes have ended both are minus infinity: the newest policy has learnt most
-        return self.score() >= self.best_score - self.recent_episodes.standard_error()
+        return self.score() >= self.best_score - self.recent_episodes.standard_error(team_sizes)
 
     # --- checkpoints
 
