@@ -82,8 +82,7 @@ class RunState:
     @property
     def updates(self) -> dict[str, tuple[int, int]]:
         """For each policy name: how many updates were rolled back, and how many there were."""
-        learners = self.setup.learners
-        return {name: (learner.rollbacks, learner.updates) for name, learner in learners.items()}
+        return {name: (learner.rollbacks, learner.updates) for name, learner in self.setup.learners.items()}
 
     def count_crashed(self, batch: Batch) -> dict[str, float]:
         """Count what crashed players have cost; return it, where there are players."""
@@ -201,7 +200,6 @@ class RunState:
         """
         if self.matches.two_sided and not self.cfg.bc.only:
             return self.matches.is_best(self.agent_steps)
-
         team_sizes = {name: behavior.slots.team_size for name, behavior in self.setup.env.behaviors.items()}
         # while too few episodes have ended both are minus infinity: the newest policy has learnt most
         return self.score() >= self.best_score - self.recent_episodes.standard_error(team_sizes)
