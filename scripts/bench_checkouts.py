@@ -20,7 +20,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from run_script import run_script
+from run_script import check_names, run_script
 
 from mappo_unity.scenes.registry import BUILT_IN
 
@@ -88,8 +88,7 @@ def main() -> None:
     options = parser.parse_args()
     if not (options.folder / "scripts" / "bench_scenes.py").is_file():
         parser.error(f"FOLDER={options.folder} must be a checkout: it has no scripts/bench_scenes.py")
-    if options.scene not in BUILT_IN:
-        parser.error(f"--scene {options.scene}: there is no such scene; there are {', '.join(BUILT_IN)}")
+    check_names([options.scene], BUILT_IN, "scene")
 
     checkouts = Path(__file__).resolve().parent.parent, options.folder.resolve()
     play = "forward" if options.forward else "random"

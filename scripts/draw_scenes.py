@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from run_script import run_script
+from run_script import check_names, run_script
 
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.scenes import make_scene
@@ -76,10 +76,7 @@ def main() -> None:
     default = Path(__file__).resolve().parents[1] / "docs" / "scenes"
     parser.add_argument("--out", type=Path, default=default)
     options = parser.parse_args()
-    for name in options.scenes:
-        if name not in BUILT_IN:
-            parser.error(f"{name}: there is no such scene; there are {', '.join(BUILT_IN)}")
-
+    check_names(options.scenes, BUILT_IN, "scene")
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.scenes:
         data = compressed(picture(name))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import socket
-from collections.abc import Iterable
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import yaml
+from run_script import check_names
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.registry import BUILT_IN
@@ -28,16 +29,15 @@ def add_peer_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--draw", action="store_true", help="run nothing")
 
 
-def check_peer_options(arguments: argparse.Namespace, scenes: Iterable[str]) -> None:
+def check_peer_options(arguments: argparse.Namespace, scenes: Collection[str]) -> None:
     """Raise ConfigError unless `scenes` can be trained by mlagents-learn, or nothing is run."""
     if arguments.draw:
         return
     if arguments.peer is None or arguments.official is None:
         raise ConfigError("--peer and --official are needed to run anything (--draw runs nothing)")
 
+    check_names(scenes, BUILT_IN, "scene")
     for scene in scenes:
-        if scene not in BUILT_IN:
-            raise ConfigError(f"{scene}: there is no such scene; there are {', '.join(BUILT_IN)}")
         official_file(arguments.official, scene)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import NoReturn
 
@@ -30,3 +30,10 @@ def run_script(main: Callable[[], int | None]) -> NoReturn:
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def check_names(names: Iterable[str], known: Collection[str], what: str) -> None:
+    """Raise ConfigError unless all `names` are known ones of a kind, which the message calls `what`."""
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"{name}: there is no such {what}; there are {', '.join(filter(None, known))}")

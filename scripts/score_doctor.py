@@ -17,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from run_script import run_script
+from run_script import check_names, run_script
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path.insert(0, str(TESTS))
@@ -42,9 +42,7 @@ def main() -> None:
     wanted = {"": ""} | faulty_env.IN_THE_GAME
     wanted |= {fault: kind for fault, (kind, _) in faulty_env.IN_THE_OPTIONS.items()}
     names = arguments.faults or list(wanted)
-    for name in names:
-        if name not in wanted:
-            parser.error(f"{name}: there is no such fault; there are {', '.join(filter(None, wanted))}")
+    check_names(names, wanted, "fault")
 
     found = 0
     os.chdir(TESTS)  # env.factory is looked for there

@@ -24,7 +24,7 @@ from typing import Any
 
 from decisions_to import read_last_lesson, with_value
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
-from run_script import run_script
+from run_script import check_names, run_script
 from score_measures import MEASURES, Measure, measures_of
 from score_page import CURVES, SCORES, write_page
 
@@ -53,9 +53,7 @@ def main() -> None:
     known = {measure.scene for measure in MEASURES}
     options = [word for word in arguments.words if "=" in word]
     scenes = [word for word in arguments.words if "=" not in word]
-    for scene in scenes:
-        if scene not in known:
-            parser.error(f"{scene}: there is no such scene; there are {', '.join(sorted(known))}")
+    check_names(scenes, sorted(known), "scene")
 
     if not arguments.draw:
         for scene in scenes or sorted(known):

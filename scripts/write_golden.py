@@ -17,7 +17,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import golden_runs
-from run_script import run_script
+from run_script import check_names, run_script
 
 
 def main() -> None:
@@ -28,10 +28,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="*", metavar="RUN")
     every = [*golden_runs.RUNS, "resume"]
     names = parser.parse_args().runs or every
-    for name in names:
-        if name not in every:
-            parser.error(f"{name}: there is no such run; there are {', '.join(every)}")
-
+    check_names(names, every, "run")
     for name in names:
         with tempfile.TemporaryDirectory() as folder:
             print(golden_runs.write(name, Path(folder) / "run"))
