@@ -272,8 +272,9 @@ def test_mappo_eval_plays_an_onnx_file_as_its_checkpoint(tiny_run, tmp_path, cap
 @pytest.mark.slow
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_run_policy_earns_what_mappo_eval_says(shared, tmp_path, deterministic):
-    """A half-trained 3DBall policy (6 of 100, 15 without sampling; a perfect one hides differences and plays for
-    minutes), within four standard errors.
+    """A half-trained 3DBall policy within four standard errors.
+
+    It earns 6 of 100, and 15 without sampling; a perfect one hides differences, and plays for minutes.
 
     Two would fail one honest run in ten (four comparisons); the many episodes keep four of them narrow, and
     the share of episodes that run_policy leaves unfinished, the longer ones, small.
