@@ -35,7 +35,8 @@ def add_actions(graph: Graph, hidden: str, head: nn.Linear, network: Actor) -> N
     if layout.squashed:
         _squashed_head(graph, hidden, head, network.init_log_std, layout.continuous)
     elif layout.continuous:
-        _continuous_head(graph, hidden, head, network.log_std, layout.continuous)
+        log_std = network.log_std.detach().clamp(*LOG_STD_RANGE)
+        _continuous_head(graph, hidden, head, network.mirrored_log_std(log_std), layout.continuous)
     if layout.branches:
         _discrete_heads(graph, hidden, head, layout)
 
@@ -43,7 +44,7 @@ def add_actions(graph: Graph, hidden: str, head: nn.Linear, network: Actor) -> N
 def _continuous_head(graph: Graph, hidden: str, head: nn.Linear, log_std: Tensor, size: int) -> None:
     """Add ``clip(mean + std * N(0, 1), +-3) / 3``, and the same without the noise."""
     mean = graph.gemm(hidden, head.weight[:size], head.bias[:size], "mean")
-    std = graph.constant("std", log_std.detach().clamp(*LOG_STD_RANGE).exp()[None])
+    std = graph.constant("std", log_std.exp()[None])
     limit = graph.constant("limit", CONTINUOUS_LIMIT)
 
     def scaled(value: str, name: str) -> None:

@@ -16,6 +16,7 @@ itself writes (opset 9, which Sentis and the Inference Engine import), whatever 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -30,9 +31,10 @@ from mappo_unity.learning.networks.encoders import OBS_CLIP
 from mappo_unity.learning.networks.recurrent import RecurrentActor
 from mappo_unity.policies.onnx_actions import BATCH, add_actions
 from mappo_unity.policies.onnx_memory import add_memory
-from mappo_unity.policies.onnx_sensors import add_sensors
+from mappo_unity.policies.onnx_sensors import add_mirrored, add_sensors, mirrored_head
 
 FORMAT = 3.0  # ML-Agents' ModelApiVersion.MLAgents2_0: an input for each sensor, actions drawn in the graph
+MIRROR = "mirror"  # metadata: the options of a mirrored network, as JSON
 OPSET, IR_VERSION = 9, 4  # those of the files that ML-Agents writes
 
 
@@ -64,7 +66,7 @@ def build_model(
     *body, head = [*network.net, actor.head] if isinstance(actor, RecurrentActor) else network.net
     if not isinstance(head, nn.Linear):
         raise ExportError(f"the policy network ends in {with_article(type(head).__name__)}, not in a Linear")
-    hidden = graph.layers(body, add_sensors(graph, network.encoder, sensors), "net")
+    hidden, head = _add_hidden(graph, network, body, head, sensors)
     if memory is not None:
         hidden = add_memory(graph, memory, hidden, BATCH)
     add_actions(graph, hidden, head, network)
@@ -76,10 +78,26 @@ def build_model(
         ir_version=IR_VERSION,
         opset_imports=[onnx.helper.make_opsetid("", OPSET)],
     )
-    onnx.helper.set_model_props(model, {"behavior_name": name, **(metadata or {})})
+    mirror = {} if network.mirror is None else {MIRROR: json.dumps(network.mirror.options)}
+    onnx.helper.set_model_props(model, {"behavior_name": name, **(metadata or {}), **mirror})
     onnx.checker.check_model(model, full_check=True)
 
     return model
+
+
+def _add_hidden(
+    graph: Graph, network: Actor, body: Sequence[nn.Module], head: nn.Linear, sensors: Sequence[Sequence[int]]
+) -> tuple[str, nn.Linear]:
+    """Add the sensors and the hidden layers; return the name of their features, and the layer behind them.
+
+    With a mirror these are the features of what is seen, and behind them those of its mirror image.
+    """
+    if network.mirror is None:
+        return graph.layers(body, add_sensors(graph, network.encoder, sensors), "net"), head
+
+    both = add_mirrored(graph, network.encoder, network.mirror, sensors)
+    hidden = graph.node("Concat", [graph.layers(body, x, "net") for x in both], axis=1)
+    return hidden, mirrored_head(network.mirror, head)
 
 
 class Graph:
@@ -104,7 +122,9 @@ class Graph:
         self.nodes.append(node)
 
     def constant(self, name: str, values: Any, dtype: type = np.float32) -> str:
-        """Add a weight; return its name."""
+        """Add a weight; return its name. A layer that is used twice has its weights once."""
+        if any(weight.name == name for weight in self.weights):
+            return name
         array: np.ndarray = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, dtype)
         self.weights.append(self.onnx.numpy_helper.from_array(array, name))
         return name
@@ -232,6 +252,7 @@ def _check_network(actor: nn.Module) -> Actor:
     if isinstance(actor, PerMember):
         raise ExportError(PER_MEMBER)
     parts = {name: type(part).__name__ for name, part in actor.named_children()}
+    parts.pop("mirror", None)
     if type(actor) is not Actor or parts != {"encoder": "Encoder", "net": "Sequential"}:
         raise ExportError(
             f"a policy network {type(actor).__name__} of the parts {parts} cannot be exported yet; "

@@ -6,9 +6,39 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
+from torch import nn
 
 from mappo_unity.learning.networks.attention import ABSENT, HEADS, EntityEncoder, ResidualSelfAttention
 from mappo_unity.learning.networks.encoders import Encoder
+from mappo_unity.learning.networks.mirror import Mirror
+
+
+def add_mirrored(graph: Any, encoder: Encoder, mirror: Mirror, sensors: Sequence[Sequence[int]]) -> list[str]:
+    """Add the inputs, all of them vectors, their mirror image, and what encodes them.
+
+    Returns:
+        The names of the features ``[batch, F]`` of both.
+    """
+    inputs = [graph.input(f"obs_{index}", shape) for index, shape in enumerate(sensors)]
+    obs = graph.node("Concat", inputs, axis=1)
+    moved = graph.node("Gather", [obs, graph.constant("mirror.columns", mirror.columns, np.int64)], axis=1)
+    image = graph.node("Mul", [moved, graph.constant("mirror.signs", mirror.signs[None])])
+    return [graph.layer(encoder.norm, x, "norm") for x in (obs, image)]
+
+
+def mirrored_head(mirror: Mirror, head: nn.Linear) -> nn.Linear:
+    """Return the layer over the hidden features of both, side by side, whose output is `Mirror.mean`.
+
+    With N for the mirror image of outputs, (W h + b + N (W h' + b)) / 2 is one layer of twice the width.
+    """
+    with torch.no_grad():
+        weight = torch.cat([head.weight, mirror.image(head.weight.T).T], 1) / 2
+        bias = (head.bias + mirror.image(head.bias)) / 2
+        joined = nn.Linear(weight.shape[1], weight.shape[0])
+        joined.weight.copy_(weight)
+        joined.bias.copy_(bias)
+    return joined
 
 
 def add_sensors(graph: Any, encoder: Encoder, sensors: Sequence[Sequence[int]]) -> str:

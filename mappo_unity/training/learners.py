@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from mlagents_envs.base_env import BehaviorSpec, ObservationSpec
 
 from mappo_unity.config.per_behavior import behavior_config, check_behaviors
-from mappo_unity.config.schema import Config, CriticKind, PPOConfig
+from mappo_unity.config.schema import Config, CriticKind, ModelConfig, PPOConfig
 from mappo_unity.envs.replay import read_fitting
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.imitation.cloning import Cloning
@@ -16,6 +16,7 @@ from mappo_unity.learning.networks.actor_critic import make_actor, make_critic
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.networks.images import check_sides
+from mappo_unity.learning.networks.mirror import make_mirror
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.rewards.streams import RewardStreams, make_intrinsic
 from mappo_unity.learning.torch_settings import check_compiles
@@ -62,6 +63,7 @@ def make_learners(
         note_unmarked(name, sensors, note)
         check_sides(name, sensors, model.image_encoder)
         layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
+        check_mirror(name, obs, layout, model)
         check_network_memory(name, obs, layout, team_size, model, rewards)
 
         # Built after the check, so that what does not fit is refused by a line of ours.
@@ -106,6 +108,14 @@ def check_learners(cfg: Config, env: Played, learners: Mapping[str, PolicyLearne
                 f"learners={cfg.learners} is more than the teams of {name!r}, of which each learner gets "
                 f"some: there are {teams}; lower learners, or raise env.num_areas"
             )
+
+
+def check_mirror(name: str, obs: ObsLayout, layout: ActionLayout, model: ModelConfig) -> None:
+    """Raise ConfigError, naming the policy, where `model.mirror` does not fit it."""
+    try:
+        make_mirror(model.mirror, obs, layout)
+    except ConfigError as error:
+        raise ConfigError(f"{error} ({name})") from error
 
 
 def note_unmarked(name: str, sensors: Sequence[ObservationSpec], note: Callable[[str], None]) -> None:

@@ -15,9 +15,11 @@ from mappo_unity.config.schema.model import (
     GoalKind,
     ImageKind,
     MemoryKind,
+    MirrorConfig,
     ModelConfig,
     WeightInit,
     bounded_log_std,
+    show_numbers,
 )
 from mappo_unity.config.schema.pages import PlotConfig, ReportConfig, XAxis
 from mappo_unity.config.schema.policies import (
@@ -82,6 +84,7 @@ __all__ = [
     "MatchConfig",
     "MatmulPrecision",
     "MemoryKind",
+    "MirrorConfig",
     "ModelConfig",
     "ObjectiveKind",
     "ObsNormUpdate",
@@ -108,4 +111,5 @@ __all__ = [
     "WeightInit",
     "XAxis",
     "bounded_log_std",
+    "show_numbers",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Optional
 
@@ -80,6 +80,57 @@ def bounded_log_std(value: float) -> float:
 
 
 @dataclass
+class MirrorConfig:
+    """What an agent senses and does, seen in a mirror that exchanges left and right; all lists empty: unused.
+
+    Columns are those of the vector observations, all sensors in one, counted from 0. Where a network mirrors,
+    it acts in the mirror image of a situation as the mirror image of how it acts in that situation.
+    """
+
+    rays: list[int] = field(default_factory=list)
+    """Ray sensors of Unity, four numbers each: first column, rays, numbers of a ray (tags + 2), stacked
+    frames; rays to the right and to the left change places."""
+    swap: list[int] = field(default_factory=list)
+    """Runs of columns that change places, three numbers each: first column of the one, first column of the
+    other, length."""
+    negate: list[int] = field(default_factory=list)
+    """Columns that change their sign; of two that change places, both."""
+    swap_actions: list[int] = field(default_factory=list)
+    """Continuous actions that change places, two numbers each."""
+    negate_actions: list[int] = field(default_factory=list)
+    """Continuous actions that change their sign; of two that change places, both."""
+    branches: list[int] = field(default_factory=list)
+    """Of each discrete action the one that takes its place, branch after branch: [0, 2, 1] for a branch of
+    none, left, right; no numbers: all stay."""
+
+    def __post_init__(self) -> None:
+        for name, group in (("rays", 4), ("swap", 3), ("swap_actions", 2)):
+            numbers = getattr(self, name)
+            if len(numbers) % group:
+                raise ConfigError(
+                    f"model.mirror.{name}={show_numbers(numbers)} holds {len(numbers)} numbers; it takes "
+                    f"{group} for each entry"
+                )
+        for each in fields(self):
+            numbers = getattr(self, each.name)
+            if any(number < 0 for number in numbers):
+                raise ConfigError(
+                    f"model.mirror.{each.name}={show_numbers(numbers)} must hold numbers from 0 on"
+                )
+
+    @property
+    def is_used(self) -> bool:
+        """Whether there is a mirror image."""
+        return any(getattr(self, each.name) for each in fields(self))
+
+
+def show_numbers(numbers: list[int]) -> str:
+    """Return numbers as they are given; of many the first ones."""
+    shown = ", ".join(map(str, numbers[:8]))
+    return f"[{shown}, ...]" if len(numbers) > 8 else f"[{shown}]"
+
+
+@dataclass
 class ModelConfig:
     """The actor's and the critic's networks."""
 
@@ -123,6 +174,8 @@ class ModelConfig:
     observation only."""
     memory_size: int = 128
     """Width of the memory's state (as in ML-Agents: an LSTM's hidden and cell state are half as wide)."""
+    mirror: MirrorConfig = field(default_factory=MirrorConfig)
+    """Networks for which left and right are the same game, of the one as of the other (docs/mirror.md)."""
     init_log_std: float = 0.0
     """Logarithm of the initial standard deviation of continuous actions (before the division by 3; with
     tanh_normal before tanh), from -5 to 2, where training keeps it."""
@@ -148,4 +201,27 @@ class ModelConfig:
                 "model.critic=poca needs model.share_parameters=true: its value is the whole team's"
             )
 
+        if self.mirror.is_used:
+            self._check_mirrored()
+
         within("model.init_log_std", self.init_log_std, *LOG_STD_RANGE)
+
+    def _check_mirrored(self) -> None:
+        for option, value, needed in (
+            ("memory", self.memory, MemoryKind.none),
+            ("flatten_branches", self.flatten_branches, False),
+        ):
+            if value != needed:
+                raise ConfigError(
+                    f"model.mirror needs model.{option}={_show(needed)}, not {_show(value)}: what that looks "
+                    "like in a mirror is not known"
+                )
+        if self.critic is CriticKind.poca:
+            raise ConfigError(
+                "model.mirror needs model.critic=local, central, mean or attention, not poca: its baseline "
+                "sees actions, which are not mirrored there"
+            )
+
+
+def _show(value: object) -> str:
+    return str(value.value) if isinstance(value, Enum) else str(value).lower()

@@ -22,6 +22,7 @@ from mappo_unity.learning.networks.critics import CentralCritic, LocalCritic, Po
 from mappo_unity.learning.networks.distributions import ActionDistribution, ActionLayout, state_log_std
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout, RunningNorm
 from mappo_unity.learning.networks.goals import condition_on_goals
+from mappo_unity.learning.networks.mirror import MirroredCritic, make_mirror
 from mappo_unity.learning.networks.mlp import apply_options, init_head, make_mlp
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import RecurrentActor, RecurrentCritic, output_size
@@ -32,6 +33,7 @@ class Actor(nn.Module):
 
     def __init__(self, obs: ObsLayout, layout: ActionLayout, cfg: ModelConfig) -> None:
         super().__init__()
+        self.mirror = make_mirror(cfg.mirror, obs, layout)
         self.encoder = Encoder(obs, cfg.normalize_obs, cfg.image_encoder, cfg.hidden[0])
 
         outputs = layout.num_means + layout.num_logits
@@ -46,7 +48,9 @@ class Actor(nn.Module):
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return distribution parameters."""
-        return self.complete(self.net(self.encoder(*obs)))
+        if self.mirror is None:
+            return self.complete(self.net(self.encoder(*obs)))
+        return self.complete(self.mirror.mean(self.net(self.encoder(self.mirror.both(*obs)))))
 
     def complete(self, out: Tensor) -> Tensor:
         """Put the standard deviations, which do not depend on observations, among the network's outputs."""
@@ -59,11 +63,15 @@ class Actor(nn.Module):
             log_std = state_log_std(out[..., size : 2 * size], self.init_log_std)
             return torch.cat([out[..., :size], log_std, out[..., 2 * size :]], -1)
 
-        log_std = self._bounded_log_std().expand(*out.shape[:-1], size)
+        log_std = self.mirrored_log_std(self._bounded_log_std()).expand(*out.shape[:-1], size)
         if not self.layout.branches:
             return torch.cat([out, log_std], -1)
 
         return torch.cat([out[..., :size], log_std, out[..., size:]], -1)
+
+    def mirrored_log_std(self, log_std: Tensor) -> Tensor:
+        """Return the log deviations ``[C]`` that actions have: with a mirror, the same on both sides."""
+        return log_std if self.mirror is None else self.mirror.mean_deviation(log_std)
 
     @torch.no_grad()
     def project(self) -> None:
@@ -232,7 +240,10 @@ def _critic(
         has_memory = cfg.memory is not MemoryKind.none
         head_size = output_size(cfg.memory, cfg.memory_size) if has_memory else None
         net = PocaCritic(obs, layout, team_size, cfg, head_size, streams)
-    return apply_options(net, cfg)
+
+    mirror = make_mirror(cfg.mirror, obs, layout)
+    net = apply_options(net, cfg)
+    return net if mirror is None else MirroredCritic(net, mirror)
 
 
 def value_layers(critic: TensorDictModule) -> list[nn.Linear]:

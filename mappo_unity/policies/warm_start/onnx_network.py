@@ -6,14 +6,17 @@ made of each sensor. Names decide only what ML-Agents fixes: those of inputs and
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from mappo_unity.config.schema import MirrorConfig
 from mappo_unity.errors import ConfigError
+from mappo_unity.policies.onnx_graph import MIRROR
 from mappo_unity.policies.warm_start.actions import Actions, read_actions
 from mappo_unity.policies.warm_start.graph import Linear, OnnxGraph
 from mappo_unity.policies.warm_start.sensors import Part, read_convolutions, read_parts
@@ -37,7 +40,8 @@ class OnnxNetwork:
     """What an ONNX file holds of a policy.
 
     Attributes: `graph`; `actions`, their layers; `state`, the memory; `layers`, the hidden ones, first to
-    last; `parts`, what the first of them takes, in its order; `vector_norm`, of all vector observations.
+    last; `parts`, what the first of them takes, in its order; `vector_norm`, of all vector observations;
+    `mirror`, the options of a network of ours that mirrors, of another one the empty ones.
     """
 
     graph: OnnxGraph
@@ -46,6 +50,7 @@ class OnnxNetwork:
     layers: list[Hidden]
     parts: list[Part]
     vector_norm: Scale | None
+    mirror: dict[str, list[int]]
 
     @property
     def options(self) -> dict[str, Any]:
@@ -55,6 +60,7 @@ class OnnxNetwork:
             "activation": self.layers[0].activation,
             "layer_norm": self.layers[0].norm is not None,
             "memory": "none" if self.state is None else self.state.kind,
+            "mirror": self.mirror,
         }
         if self.state is not None:
             out["memory_size"] = self.state.memory_size
@@ -82,6 +88,10 @@ def read_network(path: Path) -> OnnxNetwork:
     """
     graph = OnnxGraph(path)
     actions = read_actions(graph)
+    mirror = asdict(MirrorConfig())
+    if MIRROR in graph.metadata:
+        mirror |= json.loads(graph.metadata[MIRROR])
+        actions = _seen_directly(graph, actions)
     state = read_state(graph, actions.hidden)
     layers, features = _hidden_layers(graph, actions.hidden if state is None else state.features)
 
@@ -101,7 +111,23 @@ def read_network(path: Path) -> OnnxNetwork:
             f"{path}: its hidden layers differ in their kind ({', '.join(sorted(map(str, kinds)))}); those "
             "of a network here are all alike"
         )
-    return OnnxNetwork(graph, actions, state, layers, *read_parts(graph, features))
+    return OnnxNetwork(graph, actions, state, layers, *read_parts(graph, features), mirror)
+
+
+def _seen_directly(graph: OnnxGraph, actions: Actions) -> Actions:
+    """Return the actions of a mirrored network as its own layers give them (`onnx_sensors.mirrored_head`).
+
+    Those of the file take the features of a situation and, behind them, of its mirror image.
+    """
+    features = graph.node(graph.through(actions.hidden)).input[0]
+
+    def half(layer: Linear) -> Linear:
+        return layer._replace(x=features, weight=2 * layer.weight[:, : layer.weight.shape[1] // 2])
+
+    mean = None if actions.mean is None else half(actions.mean)
+    raw_std = None if actions.raw_std is None else half(actions.raw_std)
+    branches = [half(layer) for layer in actions.branches]
+    return replace(actions, mean=mean, raw_std=raw_std, branches=branches, hidden=features)
 
 
 def _hidden_layers(graph: OnnxGraph, name: str) -> tuple[list[Hidden], str]:

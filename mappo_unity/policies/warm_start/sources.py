@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import asdict, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ def adopt_file_options(config: Config, lines: list[str], file: Path | None = Non
     Raises:
         ConfigError: a given option contradicts a file, or there is no such file or checkpoint.
     """
-    given = {name.removeprefix("model.") for name in given_options(lines) if name.startswith("model.")}
+    given = {name.split(".")[1] for name in given_options(lines) if name.startswith("model.")}
     if file is not None:
         given |= set(file_root(file, lines).get("model") or {})
 
@@ -118,4 +118,6 @@ def _check_given(given: dict[str, Any], shape: dict[str, Any], where: str, path:
 
 def _plain(value: Any) -> Any:
     value = getattr(value, "value", value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
     return list(value) if isinstance(value, (list, tuple)) else value

@@ -1,0 +1,220 @@
+"""Networks for which left and right are the same game: what they do is mirrored where what they see is.
+
+A mirror image is an exchange of columns and of signs that undoes itself. With M for that of observations and
+N for that of a network's outputs, a network f becomes
+
+    g(x) = (f(x) + N f(M x)) / 2,    so that    g(M x) = N g(x)
+
+(the average over a group of two, Ravindran and Barto's symmetric policies; for PPO: Mittal et al., arXiv
+2403.04359). Unlike learning from mirrored copies of a batch, it leaves PPO's ratios what they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mappo_unity.config.schema import MirrorConfig, show_numbers
+from mappo_unity.errors import ConfigError
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
+
+
+class Mirror(nn.Module):
+    """The mirror images of observations ``[..., O]`` and of an actor's outputs ``[..., P]``.
+
+    Args:
+        columns, signs: column i of the image is ``signs[i] * x[columns[i]]``.
+        out_columns, out_signs: the same of the outputs.
+        continuous: of the outputs, how many of the first ones are means.
+        options: what it was made from, as plain values.
+    """
+
+    columns: Tensor
+    signs: Tensor
+    out_columns: Tensor
+    out_signs: Tensor
+
+    def __init__(
+        self,
+        columns: np.ndarray,
+        signs: np.ndarray,
+        out_columns: np.ndarray,
+        out_signs: np.ndarray,
+        continuous: int,
+        options: dict[str, list[int]],
+    ) -> None:
+        super().__init__()
+        for name, values, dtype in (
+            ("columns", columns, torch.int64),
+            ("signs", signs, torch.float32),
+            ("out_columns", out_columns, torch.int64),
+            ("out_signs", out_signs, torch.float32),
+        ):
+            # they follow from the options, which a checkpoint holds
+            self.register_buffer(name, torch.tensor(values.tolist(), dtype=dtype), persistent=False)
+        self.continuous, self.options = continuous, options
+
+    def both(self, obs: Tensor) -> Tensor:
+        """Return observations ``[..., O]`` and their mirror images, ``[2, ..., O]``."""
+        return torch.stack([obs, obs.index_select(-1, self.columns) * self.signs])
+
+    def image(self, out: Tensor) -> Tensor:
+        """Return the mirror image of outputs ``[..., P]``."""
+        return out.index_select(-1, self.out_columns) * self.out_signs
+
+    def mean(self, out: Tensor) -> Tensor:
+        """Return ``[..., P]``, the mean of outputs ``[2, ..., P]`` for both, seen from the first's side."""
+        return (out[0] + self.image(out[1])) / 2
+
+    def mean_deviation(self, log_std: Tensor) -> Tensor:
+        """Return logarithms of deviations ``[C]``, the same for an action and its mirror image."""
+        return (log_std + log_std[self.out_columns[: self.continuous]]) / 2
+
+
+class MirroredCritic(nn.Module):
+    """A critic whose values of a situation and of its mirror image are the same: the mean of both.
+
+    Args:
+        critic: takes vector observations, then whatever has no sides.
+        mirror: of the observations.
+    """
+
+    def __init__(self, critic: nn.Module, mirror: Mirror) -> None:
+        super().__init__()
+        self.critic, self.mirror = critic, mirror
+
+    @property
+    def head(self) -> nn.Linear:
+        """Return the layer that gives values, which PopArt rescales."""
+        head = self.critic.head
+        assert isinstance(head, nn.Linear)
+        return head
+
+    def forward(self, obs: Tensor, *flags: Tensor) -> Tensor:
+        """Return values ``[..., A, V]``."""
+        values: Tensor = self.critic(self.mirror.both(obs), *(torch.stack([x, x]) for x in flags))
+        return values.mean(0)
+
+
+def make_mirror(cfg: MirrorConfig, obs: ObsLayout, layout: ActionLayout) -> Mirror | None:
+    """Return the mirror of a policy name; None where the options describe none.
+
+    Raises:
+        ConfigError: they do not fit its observations or actions, or two images are not the original.
+    """
+    if not cfg.is_used:
+        return None
+    if obs.images or obs.sets:
+        found = "images or grids" if obs.images else "entities of varying number"
+        raise ConfigError(f"model.mirror takes vector observations alone; there are {found}, too")
+
+    columns, signs = _observations(cfg, obs.vector)
+    actions, action_signs = _continuous(cfg, layout.continuous)
+    logits = _logits(cfg, layout.branches)
+
+    # squashed actions have deviations that are outputs, behind the means
+    size, deviations = layout.continuous, layout.continuous if layout.squashed else 0
+    out_columns = np.concatenate([actions, size + actions[:deviations], size + deviations + logits])
+    out_signs = np.concatenate([action_signs, np.ones(deviations + len(logits))])
+    return Mirror(columns, signs, out_columns, out_signs, size, asdict(cfg))
+
+
+def _observations(cfg: MirrorConfig, size: int) -> tuple[np.ndarray, np.ndarray]:
+    columns = np.arange(size)
+    times = np.zeros(size, int)  # that each column changes places
+
+    for first, rays, numbers, frames in _groups(cfg.rays, 4):
+        run = np.arange(first, first + rays * numbers * frames)
+        _check_within("rays", cfg.rays, run, size, "columns")
+        if rays % 2 == 0:
+            raise ConfigError(
+                f"model.mirror.rays={show_numbers(cfg.rays)} has a sensor of {rays} rays; Unity's have one "
+                "ahead, and as many on the right as on the left"
+            )
+
+        # ahead, then right and left in turn
+        other = [0] + [ray + 1 if ray % 2 else ray - 1 for ray in range(1, rays)]
+        columns[run] = run.reshape(frames, rays, numbers)[:, other].ravel()
+        times[run] += 1
+
+    for one, another, length in _groups(cfg.swap, 3):
+        left, right = np.arange(one, one + length), np.arange(another, another + length)
+        both = np.concatenate([left, right])
+        _check_within("swap", cfg.swap, both, size, "columns")
+        columns[left], columns[right] = right, left
+        np.add.at(times, both, 1)
+
+    if (times > 1).any():
+        raise ConfigError(
+            f"model.mirror.rays and swap name column {(times > 1).argmax()} twice: it changes places once"
+        )
+    return columns, _signs("negate", cfg.negate, columns, "columns")
+
+
+def _continuous(cfg: MirrorConfig, size: int) -> tuple[np.ndarray, np.ndarray]:
+    what = "continuous actions"
+    named = np.array(cfg.swap_actions, int)
+    _check_within("swap_actions", cfg.swap_actions, named, size, what)
+    if len(set(cfg.swap_actions)) < len(named):
+        raise ConfigError(f"model.mirror.swap_actions={show_numbers(cfg.swap_actions)} names an action twice")
+
+    actions = np.arange(size)
+    actions[named[::2]], actions[named[1::2]] = named[1::2], named[::2]
+    return actions, _signs("negate_actions", cfg.negate_actions, actions, what)
+
+
+def _logits(cfg: MirrorConfig, sizes: Sequence[int]) -> np.ndarray:
+    """Return for each logit the one that takes its place."""
+    if not cfg.branches:
+        return np.arange(sum(sizes))
+
+    shown = f"model.mirror.branches={show_numbers(cfg.branches)}"
+    if len(cfg.branches) != sum(sizes):
+        raise ConfigError(
+            f"{shown} holds {len(cfg.branches)} numbers; the branches have {list(sizes)} actions, and each "
+            "of them has one"
+        )
+
+    logits, start = [], 0
+    for size in sizes:
+        own = np.array(cfg.branches[start : start + size])
+        if (own >= size).any() or (own[own] != np.arange(size)).any():
+            raise ConfigError(
+                f"{shown}: {own.tolist()} is no mirror image of a branch of {size} actions, in which two "
+                "change places or one stays"
+            )
+        logits.append(start + own)
+        start += size
+    return np.concatenate(logits)
+
+
+def _groups(numbers: Sequence[int], size: int) -> list[Sequence[int]]:
+    return [numbers[i : i + size] for i in range(0, len(numbers), size)]
+
+
+def _signs(name: str, numbers: list[int], columns: np.ndarray, what: str) -> np.ndarray:
+    """Return -1 at the numbers and 1 elsewhere; both of two that change places have the same."""
+    _check_within(name, numbers, np.array(numbers, int), len(columns), what)
+    signs = np.ones(len(columns), np.float32)
+    signs[numbers] = -1
+
+    alone = np.flatnonzero(signs != signs[columns])
+    if len(alone):
+        raise ConfigError(
+            f"model.mirror.{name}={show_numbers(numbers)} holds one of {alone[0]} and {columns[alone[0]]}, "
+            "which change places: give both or neither"
+        )
+    return signs
+
+
+def _check_within(name: str, numbers: list[int], found: np.ndarray, size: int, what: str) -> None:
+    if len(found) and found.max() >= size:
+        raise ConfigError(
+            f"model.mirror.{name}={show_numbers(numbers)} reaches to number {found.max()}; there are {size} "
+            f"{what}, counted from 0"
+        )

@@ -1,0 +1,269 @@
+"""Networks that mirror: the scenes' mirror images, the networks, what is exported, mistakes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from mlagents_envs.base_env import ActionTuple
+from onnx_fakes import data_of, inputs, make
+
+from mappo_unity.cli import train_main
+from mappo_unity.config.compose import compose_config
+from mappo_unity.config.per_behavior import behavior_config
+from mappo_unity.config.schema import CriticKind, DistributionKind, MirrorConfig, ModelConfig
+from mappo_unity.errors import ConfigError
+from mappo_unity.learning.networks.actor_critic import make_critic
+from mappo_unity.learning.networks.distributions import ActionLayout
+from mappo_unity.learning.networks.encoders import ObsLayout
+from mappo_unity.learning.networks.mirror import make_mirror
+from mappo_unity.policies.onnx_check import compare
+from mappo_unity.policies.warm_start.actors import copy_network
+from mappo_unity.policies.warm_start.onnx_network import read_network
+from mappo_unity.scenes.registry import make_scene
+
+# 3 rays of 2 numbers in 2 frames, a pair of columns, a column that changes its sign
+RAYS = {"rays": [0, 3, 2, 2], "swap": [12, 13, 1], "negate": [14]}
+CONTINUOUS = {"swap_actions": [0, 1], "negate_actions": [2]}
+LAYOUT = ActionLayout(3, (3, 2))
+
+
+# --- the scenes
+
+
+def reflect_walker(scene):
+    """Stand both figures up, the second one as the first one looks in a mirror at x = 0."""
+    scene.physics.stand(np.arange(2), np.array([0.7, -0.7]))
+    scene.goal_speed[:] = 3.0
+    scene.physics.target_position[:] = [[2.0, 0.3, 4.0], [-2.0, 0.3, 4.0]]
+    scene.cube_position[:] = [[0.5, 1.0, 0.0], [-0.5, 1.0, 0.0]]
+    scene._aim(np.arange(2))
+
+
+def reflect_soccer(scene):
+    """Make the second field what the first one looks like in a mirror at z = 0."""
+    state = scene.scene_state()
+    for part in ("position", "velocity"):
+        values = state["physics"][part]
+        values[:, :, 1] = values[:, :, 0] * np.array([[1], [-1]])
+    state["physics"]["spin"][:] = state["physics"]["kick"][:] = 0
+    state["yaw"][:, 1] = np.pi - state["yaw"][:, 0]
+    scene.load_scene_state(state)
+
+
+SIDES = "mirror.branches=[0,1,2,0,2,1,0,2,1]"
+SOCCER = ["env=SoccerTwos", "model.mirror.rays=[0,11,8,3,264,3,8,3]", f"model.{SIDES}"]
+GOALIE = [
+    "env=StrikersVsGoalie",
+    "behaviors.Striker.model.mirror.rays=[0,11,7,3,231,3,7,3]",
+    f"behaviors.Striker.model.{SIDES}",
+    "behaviors.Goalie.model.mirror.rays=[0,41,6,3]",
+    f"behaviors.Goalie.model.{SIDES}",
+]
+
+
+@pytest.mark.parametrize(
+    "lines, reflect", [(["env=Walker"], reflect_walker), (SOCCER, reflect_soccer), (GOALIE, reflect_soccer)]
+)
+def test_the_mirror_image_of_a_scene_plays_as_its_mirror_image(lines, reflect):
+    """What agents see in two areas, one the other's image, under actions that are each other's image."""
+    config = compose_config(lines).config
+    name = config.env.name
+    env = make_scene(name, num_areas=2, seed=1)
+    env.reset()
+    reflect(env)
+
+    rng = np.random.default_rng(0)
+    for decision in range(10):
+        for behavior, spec in env.behavior_specs.items():
+            steps, ended = env.get_steps(behavior)
+            agents = len(steps) // 2
+            layout = ActionLayout.from_spec(spec.action_spec)
+            model = behavior_config(config, behavior.partition("?")[0]).model
+            mirror = make_mirror(model.mirror, ObsLayout.from_specs(spec.observation_specs), layout)
+
+            obs = torch.from_numpy(np.concatenate(steps.obs, 1))
+            if decision >= 4:  # stacked frames hold what was before
+                seen = mirror.both(obs[:agents])[1]
+                assert torch.allclose(seen, obs[agents:], atol=1e-4), (behavior, decision)
+            assert not len(ended)
+
+            action = ActionTuple()
+            if layout.continuous:
+                drawn = rng.uniform(-0.3, 0.3, (agents, layout.continuous))
+                image = mirror.image(torch.from_numpy(drawn)).numpy()
+                action.add_continuous(np.concatenate([drawn, image]).astype(np.float32))
+            if layout.branches:
+                logits = rng.random((agents, layout.num_logits))
+                image = mirror.image(torch.from_numpy(logits)).numpy()
+                sizes = np.cumsum(layout.branches)[:-1]
+                both = np.split(np.concatenate([logits, image]), sizes, 1)
+                action.add_discrete(np.stack([part.argmax(1) for part in both], 1).astype(np.int32))
+            env.set_actions(behavior, action)
+        env.step()
+    env.close()
+
+
+# --- the networks
+
+
+def model(critic=CriticKind.central, **more):
+    return ModelConfig(hidden=[16], critic=critic, **more)
+
+
+@pytest.mark.parametrize("kind", DistributionKind)
+def test_an_actor_does_the_mirror_image_of_what_it_does(kind):
+    mirror = MirrorConfig(**RAYS, **CONTINUOUS, branches=[0, 2, 1, 1, 0])
+    actor = make([[12], [3]], 3, [3, 2], mirror=mirror, action_distribution=kind)[0].module
+    with torch.no_grad():
+        if kind is DistributionKind.gaussian:
+            actor.log_std.copy_(torch.tensor([0.1, 0.5, -0.3]))
+    obs = torch.randn(7, 15)
+
+    image = obs.clone()
+    for ray in (2, 8):  # the second ray of a frame and the third
+        image[:, ray : ray + 4] = obs[:, [ray + 2, ray + 3, ray, ray + 1]]
+    image[:, 12:14], image[:, 14] = obs[:, [13, 12]], -obs[:, 14]
+    found, other = actor(obs), actor(image)
+
+    assert torch.allclose(other[:, :3], found[:, [1, 0, 2]] * torch.tensor([1.0, 1, -1]), atol=1e-6)
+    assert torch.allclose(other[:, 3:6], found[:, [4, 3, 5]], atol=1e-6)  # deviations
+    assert torch.allclose(other[:, 6:], found[:, [6, 8, 7, 10, 9]], atol=1e-5)
+    assert found[:, 6:].std(0).min() > 1e-3 and (found - other).abs().max() > 1e-2  # not by being constant
+
+
+@pytest.mark.parametrize(
+    "critic", [CriticKind.local, CriticKind.central, CriticKind.mean, CriticKind.attention]
+)
+def test_a_critic_values_a_situation_as_its_mirror_image(critic):
+    cfg = model(critic, mirror=MirrorConfig(**RAYS))
+    net = make_critic(ObsLayout(15), 2, cfg, LAYOUT, streams=2)
+    torch.nn.init.normal_(net.module.head.weight)
+    obs, present = torch.randn(5, 2, 15), torch.rand(5, 2, 1) < 0.8
+    flags = [] if critic is CriticKind.local else [present, torch.zeros_like(present)]
+
+    image = net.module.mirror.both(obs)[1]
+    found, other = net.module(obs, *flags), net.module(image, *flags)
+    assert found.shape == (5, 2, 2) and torch.allclose(found, other, atol=1e-5)
+    assert found.std() > 0.1
+
+    half = obs.clone()
+    half[:, 1] = image[:, 1]  # of one member alone is another situation
+    apart = (net.module(half, *flags) - found).abs().max()
+    assert apart < 1e-5 if critic is CriticKind.local else apart > 1e-3
+
+
+def test_without_a_mirror_nothing_is_different():
+    assert make_mirror(MirrorConfig(), ObsLayout(4), LAYOUT) is None
+    names = make_critic(ObsLayout(4), 1, ModelConfig(), LAYOUT).state_dict()
+    assert not any("mirror" in name or "critic" in name for name in names)
+
+
+# --- files
+
+
+@pytest.mark.parametrize("kind", DistributionKind)
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_an_onnx_file_plays_as_its_network_and_gives_it_back(tmp_path, kind, layer_norm):
+    mirror = MirrorConfig(**RAYS, **CONTINUOUS, branches=[0, 2, 1, 1, 0])
+    options = {"mirror": mirror, "action_distribution": kind, "layer_norm": layer_norm}
+    sensors = [[12], [3]]
+    scale = 20 if kind is DistributionKind.tanh_normal else 200
+    actor, sample = make(sensors, 3, [3, 2], head_scale=scale, **options), inputs(sensors, [3, 2])
+    data = data_of(actor, sensors)
+    assert compare(data, actor, sensors, sample) <= 1e-5
+
+    # a layer that is used twice has its weights once
+    plain = data_of(make(sensors, 3, [3, 2], **(options | {"mirror": MirrorConfig()})), sensors)
+    assert len(data) < 1.5 * len(plain)
+
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(data)
+    network = read_network(path)
+    assert network.options["mirror"] == {
+        "rays": [0, 3, 2, 2],
+        "swap": [12, 13, 1],
+        "negate": [14],
+        "swap_actions": [0, 1],
+        "negate_actions": [2],
+        "branches": [0, 2, 1, 1, 0],
+    }
+    other = make(sensors, 3, [3, 2], **options)
+    rows, error = copy_network(network, other, sensors)
+    assert not any(row.reason for row in rows) and error <= 1e-5
+
+
+TINY = ["env=Basic", "max_steps=512", "collect.batch_size=128", "log.loggers=[]", "log.progress=false"]
+BASIC = "model.mirror.swap=[0,19,1,1,18,1,2,17,1]"
+
+
+def test_a_run_trains_resumes_and_is_what_others_begin_with(tmp_path, capsys):
+    run = tmp_path / "run"
+    lines = [*TINY, BASIC, "model.mirror.branches=[0,2,1]", f"hydra.run.dir={run}"]
+    assert train_main(lines) == 0
+    assert train_main([f"resume={run}", "max_steps=1024"]) == 0
+    capsys.readouterr()
+    assert train_main([f"resume={run}", "max_steps=2048", "model.mirror.branches=[0,1,2]"]) == 2
+    assert "model.mirror" in capsys.readouterr().err
+
+    # the file has a mirror, which a run that begins with it takes over
+    begun = tmp_path / "begun"
+    assert train_main([*TINY, f"init_from={run}/checkpoints/final.onnx", f"hydra.run.dir={begun}"]) == 0
+    state = torch.load(sorted((begun / "checkpoints").glob("*.pt"))[-1], weights_only=False)
+    assert state["model"]["Basic"]["mirror"]["branches"] == [0, 2, 1]
+    capsys.readouterr()
+    lines = [*TINY, f"init_from={run}/checkpoints/final.onnx", "model.mirror.negate=[3]"]
+    assert train_main([*lines, f"hydra.run.dir={tmp_path / 'no'}"]) == 2
+    assert "contradicts" in capsys.readouterr().err
+
+
+# --- mistakes
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"rays": [0, 3, 2]}, "rays=[0, 3, 2] holds 3 numbers; it takes 4 for each entry"),
+        ({"negate": [-1]}, "negate=[-1] must hold numbers from 0 on"),
+        ({"rays": [0, 4, 2, 1]}, "has a sensor of 4 rays; Unity's have one ahead"),
+        (
+            {"rays": [0, 5, 4, 1]},
+            "rays=[0, 5, 4, 1] reaches to number 19; there are 15 columns",
+        ),
+        ({"swap": [0, 15, 1]}, "swap=[0, 15, 1] reaches to number 15; there are 15 columns"),
+        ({"rays": [0, 3, 2, 1], "swap": [5, 6, 1]}, "name column 5 twice: it changes places once"),
+        (
+            {"swap": [3, 4, 1], "negate": [4]},
+            "holds one of 3 and 4, which change places",
+        ),
+        ({"negate": [15]}, "negate=[15] reaches to number 15; there are 15 columns"),
+        ({"swap_actions": [0, 3]}, "reaches to number 3; there are 3 continuous actions"),
+        ({"swap_actions": [0, 1, 1, 2]}, "swap_actions=[0, 1, 1, 2] names an action twice"),
+        ({"negate_actions": [9]}, "negate_actions=[9] reaches to number 9; there are 3 continuous actions"),
+        ({"branches": [0, 2, 1]}, "holds 3 numbers; the branches have [3, 2] actions"),
+        ({"branches": [1, 2, 0, 0, 1]}, "[1, 2, 0] is no mirror image of a branch of 3 actions"),
+        ({"branches": [0, 1, 2, 0, 3]}, "[0, 3] is no mirror image of a branch of 2 actions"),
+    ],
+)
+def test_what_is_no_mirror_image_is_refused(options, message):
+    with pytest.raises(ConfigError) as error:
+        make_mirror(MirrorConfig(**options), ObsLayout(15), LAYOUT)
+    assert message in str(error.value) and str(error.value).startswith("model.mirror")
+
+
+@pytest.mark.parametrize(
+    "lines, message",
+    [
+        (["env=Basic", "model.mirror.swap=[0,20,1]"], "there are 20 columns, counted from 0 (Basic)"),
+        (
+            ["env=GridFoodCollector", "model.mirror.negate=[0]"],
+            "takes vector observations alone",
+        ),
+        (["env=Basic", BASIC, "model.memory=lstm"], "model.mirror needs model.memory=none, not lstm"),
+        (["env=Basic", BASIC, "model.critic=poca"], "not poca: its baseline sees actions"),
+        ([*SOCCER, "model.flatten_branches=true"], "needs model.flatten_branches=false, not true"),
+    ],
+)
+def test_what_cannot_be_mirrored_ends_with_a_line(lines, message, tmp_path, capsys):
+    assert train_main([*lines, f"hydra.run.dir={tmp_path / 'run'}"]) == 2
+    assert message in capsys.readouterr().err
