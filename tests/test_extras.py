@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -22,6 +23,25 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_the_place_is_where_the_package_lies() -> None:
     assert (extras.ROOT / "mappo_unity" / "__init__.py").is_file()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="scripts/setup is a shell script")
+@pytest.mark.parametrize(
+    "wanted, wrong", [("video,pettingzoo", "pettingzoo"), ("video hub", "video hub"), ("hu*", "hu*")]
+)
+def test_an_extra_that_does_not_exist_is_refused_before_anything_is_installed(
+    tmp_path: Path, wanted: str, wrong: str
+) -> None:
+    (tmp_path / "scripts").mkdir()
+    for name in ("pyproject.toml", "scripts/setup"):
+        (tmp_path / name).write_bytes((extras.ROOT / name).read_bytes())
+    done = subprocess.run(
+        ["bash", str(tmp_path / "scripts" / "setup"), wanted], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 2 and not (tmp_path / ".venv").exists()
+    assert done.stderr.startswith(
+        f"scripts/setup: there is no extra '{wrong}'; choices: test, sweep, search, "
+    )
 
 
 def make_clone(place: Path) -> None:
