@@ -11,7 +11,7 @@ from onnx_fakes import data_of, inputs, make
 from mappo_unity.cli import train_main
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.per_behavior import behavior_config
-from mappo_unity.config.schema import CriticKind, DistributionKind, MirrorConfig, ModelConfig
+from mappo_unity.config.schema import CriticKind, DistributionKind, ImageKind, MirrorConfig, ModelConfig
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.actor_critic import make_critic
 from mappo_unity.learning.networks.distributions import ActionLayout
@@ -84,7 +84,7 @@ def test_the_mirror_image_of_a_scene_plays_as_its_mirror_image(lines, reflect):
 
             obs = torch.from_numpy(np.concatenate(steps.obs, 1))
             if decision >= 4:  # stacked frames hold what was before
-                seen = mirror.both(obs[:agents])[1]
+                seen = mirror.both(obs[:agents])[0][1]
                 assert torch.allclose(seen, obs[agents:], atol=1e-4), (behavior, decision)
             assert not len(ended)
 
@@ -142,7 +142,7 @@ def test_a_critic_values_a_situation_as_its_mirror_image(critic):
     obs, present = torch.randn(5, 2, 15), torch.rand(5, 2, 1) < 0.8
     flags = [] if critic is CriticKind.local else [present, torch.zeros_like(present)]
 
-    image = net.module.mirror.both(obs)[1]
+    image = net.module.mirror.both(obs)[0][1]
     found, other = net.module(obs, *flags), net.module(image, *flags)
     assert found.shape == (5, 2, 2) and torch.allclose(found, other, atol=1e-5)
     assert found.std() > 0.1
@@ -184,6 +184,7 @@ def test_an_onnx_file_plays_as_its_network_and_gives_it_back(tmp_path, kind, lay
         "rays": [0, 3, 2, 2],
         "swap": [12, 13, 1],
         "negate": [14],
+        "flip_images": False,
         "swap_actions": [0, 1],
         "negate_actions": [2],
         "branches": [0, 2, 1, 1, 0],
@@ -191,6 +192,47 @@ def test_an_onnx_file_plays_as_its_network_and_gives_it_back(tmp_path, kind, lay
     other = make(sensors, 3, [3, 2], **options)
     rows, error = copy_network(network, other, sensors)
     assert not any(row.reason for row in rows) and error <= 1e-5
+
+
+IMAGES = {
+    "grid": ([[4], [3, 6, 7]], {}),
+    "image alone, channels last": ([[22, 20, 3]], {}),
+    "several, layer norms": ([[3], [3, 22, 20], [1], [24, 20, 1]], {"layer_norm": True}),
+    "residual": ([[16, 18, 2], [4]], {"image_encoder": ImageKind.resnet}),
+}
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_images_have_a_mirror_image(name, tmp_path):
+    sensors, options = IMAGES[name]
+    negate = [1] if len(sensors) > 1 else []
+    cfg = options | {"mirror": MirrorConfig(negate=negate, flip_images=True, branches=[0, 2, 1])}
+    actor, sample = make(sensors, 1, [3], **cfg), inputs(sensors, [3])
+    net = actor[0].module
+    obs = [sample[key] for key in actor.obs_keys]
+    image = [both[1] for both in net.mirror.both(*obs)]
+
+    for seen, found in zip(obs, image):
+        if seen.ndim == 4:
+            columns = 2 if seen.shape[-1] <= 3 else 3  # channels last, or first
+            assert torch.equal(found, seen.flip(columns)) and not torch.equal(found, seen)
+    found, other = net(*obs), net(*image)
+    assert torch.allclose(other, found[:, [0, 1, 2, 4, 3]], atol=1e-4)
+    assert found[:, 2:].std(0).min() > 1e-2 and (found - other).abs().max() > 1e-2
+
+    data = data_of(actor, sensors)
+    assert compare(data, actor, sensors, sample) <= 1e-5
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(data)
+    rows, error = copy_network(read_network(path), make(sensors, 1, [3], **cfg), sensors)
+    assert not any(row.reason for row in rows) and error <= 1e-5
+
+
+def test_a_team_that_sees_images_learns_with_a_mirror(tmp_path):
+    lines = ["env=CooperativePushBlock", "max_steps=300", "collect.batch_size=240", "log.loggers=[]"]
+    mirror = ["model.mirror.flip_images=true", "model.mirror.branches=[0,1,2,4,3,6,5]", "log.progress=false"]
+    assert train_main([*lines, *mirror, "model.mirror.negate=[0]", f"hydra.run.dir={tmp_path / 'run'}"]) == 0
+    assert (tmp_path / "run" / "checkpoints" / "final.onnx").exists()
 
 
 TINY = ["env=Basic", "max_steps=512", "collect.batch_size=128", "log.loggers=[]", "log.progress=false"]
@@ -256,8 +298,12 @@ def test_what_is_no_mirror_image_is_refused(options, message):
     [
         (["env=Basic", "model.mirror.swap=[0,20,1]"], "there are 20 columns, counted from 0 (Basic)"),
         (
-            ["env=GridFoodCollector", "model.mirror.negate=[0]"],
-            "takes vector observations alone",
+            ["env=GridFoodCollector", "model.mirror.branches=[1,0]"],
+            "needs model.mirror.flip_images=true, since",
+        ),
+        (
+            ["env=Basic", BASIC, "model.mirror.flip_images=true"],
+            "flip_images=true has no effect: there are no images",
         ),
         (["env=Basic", BASIC, "model.memory=lstm"], "model.mirror needs model.memory=none, not lstm"),
         (["env=Basic", BASIC, "model.critic=poca"], "not poca: its baseline sees actions"),

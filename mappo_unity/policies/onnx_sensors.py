@@ -15,16 +15,37 @@ from mappo_unity.learning.networks.mirror import Mirror
 
 
 def add_mirrored(graph: Any, encoder: Encoder, mirror: Mirror, sensors: Sequence[Sequence[int]]) -> list[str]:
-    """Add the inputs, all of them vectors, their mirror image, and what encodes them.
+    """Add the inputs, vectors and images, their mirror image, and what encodes them.
 
     Returns:
         The names of the features ``[batch, F]`` of both.
     """
-    inputs = [graph.input(f"obs_{index}", shape) for index, shape in enumerate(sensors)]
-    obs = graph.node("Concat", inputs, axis=1)
-    moved = graph.node("Gather", [obs, graph.constant("mirror.columns", mirror.columns, np.int64)], axis=1)
-    image = graph.node("Mul", [moved, graph.constant("mirror.signs", mirror.signs[None])])
-    return [graph.layer(encoder.norm, x, "norm") for x in (obs, image)]
+    vectors: list[str] = []
+    features: list[list[str]] = [[], []]  # of what is seen, of its mirror image
+    encoders = iter(encoder.images)
+
+    for index, shape in enumerate(sensors):
+        name = f"obs_{index}"
+        if len(shape) == 1:
+            vectors.append(graph.input(name, shape))
+            continue
+        net: Any = next(encoders)
+        shape = channels_first(shape) if net.channels_last else shape
+        x = graph.input(name, shape)
+        reverse = graph.constant(f"mirror.{name}", np.arange(shape[2])[::-1], np.int64)
+        both = [x, graph.node("Gather", [x, reverse], axis=3)]
+        for side, seen in zip(features, both):
+            code = graph.layer(net.conv, seen, f"{name}.conv")
+            side.append(graph.layer(net.out, code, f"{name}.out"))
+
+    if vectors:
+        obs = graph.node("Concat", vectors, axis=1)
+        columns = graph.constant("mirror.columns", mirror.columns, np.int64)
+        signs = graph.constant("mirror.signs", mirror.signs[None])
+        image = graph.node("Mul", [graph.node("Gather", [obs, columns], axis=1), signs])
+        for side, seen in zip(features, (obs, image)):
+            side.insert(0, graph.layer(encoder.norm, seen, "norm"))
+    return [_joined(graph, side) or "" for side in features]
 
 
 def mirrored_head(mirror: Mirror, head: nn.Linear) -> nn.Linear:

@@ -81,7 +81,7 @@ def bounded_log_std(value: float) -> float:
 
 @dataclass
 class MirrorConfig:
-    """What an agent senses and does, seen in a mirror that exchanges left and right; all lists empty: unused.
+    """What an agent senses and does, in a mirror that exchanges left and right; with nothing given: unused.
 
     Columns are those of the vector observations, all sensors in one, counted from 0. Where a network mirrors,
     it acts in the mirror image of a situation as the mirror image of how it acts in that situation.
@@ -95,6 +95,8 @@ class MirrorConfig:
     other, length."""
     negate: list[int] = field(default_factory=list)
     """Columns that change their sign; of two that change places, both."""
+    flip_images: bool = False
+    """Images and grids have a mirror image, too: their columns of pixels or cells in reverse order."""
     swap_actions: list[int] = field(default_factory=list)
     """Continuous actions that change places, two numbers each."""
     negate_actions: list[int] = field(default_factory=list)
@@ -111,17 +113,19 @@ class MirrorConfig:
                     f"model.mirror.{name}={show_numbers(numbers)} holds {len(numbers)} numbers; it takes "
                     f"{group} for each entry"
                 )
-        for each in fields(self):
-            numbers = getattr(self, each.name)
+        for name, numbers in self.lists().items():
             if any(number < 0 for number in numbers):
-                raise ConfigError(
-                    f"model.mirror.{each.name}={show_numbers(numbers)} must hold numbers from 0 on"
-                )
+                raise ConfigError(f"model.mirror.{name}={show_numbers(numbers)} must hold numbers from 0 on")
+
+    def lists(self) -> dict[str, list[int]]:
+        """Return the options that are lists of numbers, by their names."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, list)}
 
     @property
     def is_used(self) -> bool:
         """Whether there is a mirror image."""
-        return any(getattr(self, each.name) for each in fields(self))
+        return self.flip_images or any(self.lists().values())
 
 
 def show_numbers(numbers: list[int]) -> str:

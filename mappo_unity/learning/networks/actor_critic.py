@@ -50,7 +50,7 @@ class Actor(nn.Module):
         """Return distribution parameters."""
         if self.mirror is None:
             return self.complete(self.net(self.encoder(*obs)))
-        return self.complete(self.mirror.mean(self.net(self.encoder(self.mirror.both(*obs)))))
+        return self.complete(self.mirror.mean(self.net(self.encoder(*self.mirror.both(*obs)))))
 
     def complete(self, out: Tensor) -> Tensor:
         """Put the standard deviations, which do not depend on observations, among the network's outputs."""

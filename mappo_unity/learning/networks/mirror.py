@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,13 +23,16 @@ from mappo_unity.config.schema import MirrorConfig, show_numbers
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
+from mappo_unity.scenes.contract.images import FIRST
 
 
 class Mirror(nn.Module):
-    """The mirror images of observations ``[..., O]`` and of an actor's outputs ``[..., P]``.
+    """The mirror images of an agent's observations and of an actor's outputs ``[..., P]``.
 
     Args:
-        columns, signs: column i of the image is ``signs[i] * x[columns[i]]``.
+        columns, signs: of vectors ``[..., O]`` column i of the image is ``signs[i] * x[columns[i]]``; none
+            where there are no vectors.
+        widths: of each image the dimension of its columns, counted from the end.
         out_columns, out_signs: the same of the outputs.
         continuous: of the outputs, how many of the first ones are means.
         options: what it was made from, as plain values.
@@ -43,10 +47,11 @@ class Mirror(nn.Module):
         self,
         columns: np.ndarray,
         signs: np.ndarray,
+        widths: Sequence[int],
         out_columns: np.ndarray,
         out_signs: np.ndarray,
         continuous: int,
-        options: dict[str, list[int]],
+        options: dict[str, Any],
     ) -> None:
         super().__init__()
         for name, values, dtype in (
@@ -57,11 +62,20 @@ class Mirror(nn.Module):
         ):
             # they follow from the options, which a checkpoint holds
             self.register_buffer(name, torch.tensor(values.tolist(), dtype=dtype), persistent=False)
-        self.continuous, self.options = continuous, options
+        self.widths, self.continuous, self.options = list(widths), continuous, options
 
-    def both(self, obs: Tensor) -> Tensor:
-        """Return observations ``[..., O]`` and their mirror images, ``[2, ..., O]``."""
-        return torch.stack([obs, obs.index_select(-1, self.columns) * self.signs])
+    def both(self, *obs: Tensor) -> list[Tensor]:
+        """Return each of an agent's observations ``[..., *]`` and its mirror image, ``[2, ..., *]``.
+
+        Args:
+            obs: the entries in the order of `ObsLayout.keys`.
+        """
+        images = list(obs)
+        out = []
+        if len(self.columns):
+            vector = images.pop(0)
+            out.append(torch.stack([vector, vector.index_select(-1, self.columns) * self.signs]))
+        return out + [torch.stack([x, x.flip(dim)]) for x, dim in zip(images, self.widths, strict=True)]
 
     def image(self, out: Tensor) -> Tensor:
         """Return the mirror image of outputs ``[..., P]``."""
@@ -80,7 +94,7 @@ class MirroredCritic(nn.Module):
     """A critic whose values of a situation and of its mirror image are the same: the mean of both.
 
     Args:
-        critic: takes vector observations, then whatever has no sides.
+        critic: takes an agent's observations, then whatever has no sides.
         mirror: of the observations.
     """
 
@@ -95,9 +109,11 @@ class MirroredCritic(nn.Module):
         assert isinstance(head, nn.Linear)
         return head
 
-    def forward(self, obs: Tensor, *flags: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor) -> Tensor:
         """Return values ``[..., A, V]``."""
-        values: Tensor = self.critic(self.mirror.both(obs), *(torch.stack([x, x]) for x in flags))
+        count = bool(len(self.mirror.columns)) + len(self.mirror.widths)
+        flags = [torch.stack([flag, flag]) for flag in inputs[count:]]
+        values: Tensor = self.critic(*self.mirror.both(*inputs[:count]), *flags)
         return values.mean(0)
 
 
@@ -109,9 +125,16 @@ def make_mirror(cfg: MirrorConfig, obs: ObsLayout, layout: ActionLayout) -> Mirr
     """
     if not cfg.is_used:
         return None
-    if obs.images or obs.sets:
-        found = "images or grids" if obs.images else "entities of varying number"
-        raise ConfigError(f"model.mirror takes vector observations alone; there are {found}, too")
+    if obs.sets:
+        raise ConfigError(
+            "model.mirror has no mirror image of entities of varying number, and some are there"
+        )
+    if bool(obs.images) != cfg.flip_images:
+        raise ConfigError(
+            "model.mirror.flip_images=true has no effect: there are no images or grids"
+            if cfg.flip_images
+            else "model.mirror needs model.mirror.flip_images=true, since there are images or grids, too"
+        )
 
     columns, signs = _observations(cfg, obs.vector)
     actions, action_signs = _continuous(cfg, layout.continuous)
@@ -121,7 +144,9 @@ def make_mirror(cfg: MirrorConfig, obs: ObsLayout, layout: ActionLayout) -> Mirr
     size, deviations = layout.continuous, layout.continuous if layout.squashed else 0
     out_columns = np.concatenate([actions, size + actions[:deviations], size + deviations + logits])
     out_signs = np.concatenate([action_signs, np.ones(deviations + len(logits))])
-    return Mirror(columns, signs, out_columns, out_signs, size, asdict(cfg))
+    dims = obs.channel_dims or (FIRST,) * len(obs.images)
+    widths = [-1 if dim == FIRST else -2 for dim in dims]
+    return Mirror(columns, signs, widths, out_columns, out_signs, size, asdict(cfg))
 
 
 def _observations(cfg: MirrorConfig, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -50,7 +50,7 @@ class OnnxNetwork:
     layers: list[Hidden]
     parts: list[Part]
     vector_norm: Scale | None
-    mirror: dict[str, list[int]]
+    mirror: dict[str, Any]
 
     @property
     def options(self) -> dict[str, Any]:
