@@ -256,7 +256,9 @@ def test_a_run_trains_resumes_and_is_what_others_begin_with(tmp_path, capsys):
     capsys.readouterr()
     lines = [*TINY, f"init_from={run}/checkpoints/final.onnx", "model.mirror.negate=[3]"]
     assert train_main([*lines, f"hydra.run.dir={tmp_path / 'no'}"]) == 2
-    assert "contradicts" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "model.mirror=(negate=[3]) contradicts" in said
+    assert "has mirror=(swap=[0, 19, 1, 1, 18, 1, 2, 17, ...] branches=[0, 2, 1]): leave" in said
 
 
 # --- mistakes

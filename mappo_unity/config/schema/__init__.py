@@ -19,6 +19,7 @@ from mappo_unity.config.schema.model import (
     ModelConfig,
     WeightInit,
     bounded_log_std,
+    show_mirror,
     show_numbers,
 )
 from mappo_unity.config.schema.pages import PlotConfig, ReportConfig, XAxis
@@ -111,5 +112,6 @@ __all__ = [
     "WeightInit",
     "XAxis",
     "bounded_log_std",
+    "show_mirror",
     "show_numbers",
 ]

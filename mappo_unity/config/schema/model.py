@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from enum import Enum
-from typing import Optional
+from typing import Any, Optional
 
 from mappo_unity.config.schema.checks import at_least, widths, within
 from mappo_unity.errors import ConfigError
@@ -126,6 +126,13 @@ class MirrorConfig:
     def is_used(self) -> bool:
         """Whether there is a mirror image."""
         return self.flip_images or any(self.lists().values())
+
+
+def show_mirror(options: dict[str, Any]) -> str:
+    """Return what is given of `MirrorConfig`, which stands there as plain values, in a few words."""
+    given = {name: value for name, value in options.items() if value}
+    shown = (f"{name}={'true' if value is True else show_numbers(value)}" for name, value in given.items())
+    return f"({' '.join(shown)})" if given else "none"
 
 
 def show_numbers(numbers: list[int]) -> str:

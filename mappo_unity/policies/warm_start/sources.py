@@ -13,10 +13,11 @@ from omegaconf import OmegaConf
 from mappo_unity.config.option_table import show_value
 from mappo_unity.config.options_file import file_root
 from mappo_unity.config.overrides import given_options
-from mappo_unity.config.schema import Config, ModelConfig
+from mappo_unity.config.schema import Config, MirrorConfig, ModelConfig, show_mirror
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.policy_files import Kind, Source, check_checkpoint, locate
 
+MIRROR = "mirror"
 STARTS = "a run folder, a checkpoint (.pt) or an ONNX file"
 
 
@@ -109,10 +110,17 @@ def _adopted(
 
 def _check_given(given: dict[str, Any], shape: dict[str, Any], where: str, path: str) -> None:
     for key, value in given.items():
-        if key in shape and _plain(value) != shape[key]:
+        if key not in shape:
+            continue
+        value = _plain(value)
+        if key == MIRROR:
+            value = _plain(MirrorConfig()) | value  # of a behavior only what is given stands there
+
+        if value != shape[key]:
+            own, theirs = (show_mirror(v) if key == MIRROR else show_value(v) for v in (value, shape[key]))
             raise ConfigError(
-                f"{where}.{key}={show_value(_plain(value))} contradicts {path}, whose network has "
-                f"{key}={show_value(shape[key])}: leave the option out, and it is taken from the file"
+                f"{where}.{key}={own} contradicts {path}, whose network has {key}={theirs}: leave the option "
+                "out, and it is taken from the file"
             )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from mappo_unity.config.option_table import show_value
 from mappo_unity.config.per_behavior import init_source
-from mappo_unity.config.schema import Config
+from mappo_unity.config.schema import Config, show_mirror
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.value_norm import by_stream
@@ -76,7 +76,9 @@ def _from_onnx(path: Path, learner: PolicyLearner, layout: Mapping[str, Any]) ->
 
 def show_options(options: Mapping[str, Any]) -> str:
     """Return the options of a network as a line of `name=value`."""
-    return " ".join(f"{name}={show_value(value)}" for name, value in options.items())
+    shown = [f"{name}={show_value(value)}" for name, value in options.items() if name != "mirror"]
+    mirror = show_mirror(options["mirror"])
+    return " ".join(shown + [f"mirror={mirror}"] * (mirror != "none"))
 
 
 def _from_checkpoint(path: Path, name: str, learner: PolicyLearner) -> tuple[str, list[Row]]:
