@@ -5,8 +5,9 @@ N for that of a network's outputs, a network f becomes
 
     g(x) = (f(x) + N f(M x)) / 2,    so that    g(M x) = N g(x)
 
-(the average over a group of two, Ravindran and Barto's symmetric policies; for PPO: Mittal et al., arXiv
-2403.04359). Unlike learning from mirrored copies of a batch, it leaves PPO's ratios what they are.
+the average over a group of two (networks that keep a game's symmetry: van der Pol et al., arXiv 2006.16908).
+Unlike learning from mirrored copies of a batch (Mittal et al., arXiv 2403.04359), it leaves PPO's ratios what
+they are.
 """
 
 from __future__ import annotations
