@@ -31,7 +31,7 @@ from mappo_unity.learning.networks.encoders import OBS_CLIP
 from mappo_unity.learning.networks.recurrent import RecurrentActor
 from mappo_unity.policies.onnx_actions import BATCH, add_actions
 from mappo_unity.policies.onnx_memory import add_memory
-from mappo_unity.policies.onnx_sensors import add_mirrored, add_sensors, mirrored_head
+from mappo_unity.policies.onnx_sensors import add_sensors, mirrored_head
 
 FORMAT = 3.0  # ML-Agents' ModelApiVersion.MLAgents2_0: an input for each sensor, actions drawn in the graph
 MIRROR = "mirror"  # metadata: the options of a mirrored network, as JSON
@@ -92,12 +92,11 @@ def _add_hidden(
 
     With a mirror these are the features of what is seen, and behind them those of its mirror image.
     """
+    features = add_sensors(graph, network.encoder, sensors, network.mirror)
+    hidden = [graph.layers(body, x, "net") for x in features]
     if network.mirror is None:
-        return graph.layers(body, add_sensors(graph, network.encoder, sensors), "net"), head
-
-    both = add_mirrored(graph, network.encoder, network.mirror, sensors)
-    hidden = graph.node("Concat", [graph.layers(body, x, "net") for x in both], axis=1)
-    return hidden, mirrored_head(network.mirror, head)
+        return hidden[0], head
+    return graph.node("Concat", hidden, axis=1), mirrored_head(network.mirror, head)
 
 
 class Graph:

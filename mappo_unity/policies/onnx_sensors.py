@@ -14,38 +14,67 @@ from mappo_unity.learning.networks.encoders import Encoder
 from mappo_unity.learning.networks.mirror import Mirror
 
 
-def add_mirrored(graph: Any, encoder: Encoder, mirror: Mirror, sensors: Sequence[Sequence[int]]) -> list[str]:
-    """Add the inputs, vectors and images, their mirror image, and what encodes them.
+def add_sensors(
+    graph: Any, encoder: Encoder, sensors: Sequence[Sequence[int]], mirror: Mirror | None = None
+) -> list[str]:
+    """Add the inputs and what encodes them.
+
+    Args:
+        graph: an `onnx_graph.Graph`.
+        encoder: the module.
+        sensors: shape of every sensor, without the batch.
+        mirror: of the observations, among which there are no entities then.
 
     Returns:
-        The names of the features ``[batch, F]`` of both.
+        The names of the features ``[batch, F]`` of what is seen and, with a mirror, of its image.
     """
-    vectors: list[str] = []
-    features: list[list[str]] = [[], []]  # of what is seen, of its mirror image
-    encoders = iter(encoder.images)
-
+    vectors, sets = [], []
+    sides: list[list[str]] = [[]] if mirror is None else [[], []]
+    images = iter(encoder.images)
     for index, shape in enumerate(sensors):
         name = f"obs_{index}"
         if len(shape) == 1:
             vectors.append(graph.input(name, shape))
-            continue
-        net: Any = next(encoders)
-        shape = channels_first(shape) if net.channels_last else shape
-        x = graph.input(name, shape)
-        reverse = graph.constant(f"mirror.{name}", np.arange(shape[2])[::-1], np.int64)
-        both = [x, graph.node("Gather", [x, reverse], axis=3)]
-        for side, seen in zip(features, both):
-            code = graph.layer(net.conv, seen, f"{name}.conv")
-            side.append(graph.layer(net.out, code, f"{name}.out"))
+        elif len(shape) == 2:
+            sets.append((graph.input(name, shape), shape))
+        else:
+            image: Any = next(images)
+            shape = channels_first(shape) if image.channels_last else shape
+            views = [graph.input(name, shape)]
+            if mirror is not None:
+                reverse = graph.constant(f"mirror.{name}", np.arange(shape[2])[::-1], np.int64)
+                views.append(graph.node("Gather", [views[0], reverse], axis=3))
+            for features, view in zip(sides, views):
+                x = graph.layer(image.conv, view, f"{name}.conv")
+                features.append(graph.layer(image.out, x, f"{name}.out"))
 
+    # The MLP takes the vectors first, wherever their sensors stand.
     if vectors:
-        obs = graph.node("Concat", vectors, axis=1)
-        columns = graph.constant("mirror.columns", mirror.columns, np.int64)
-        signs = graph.constant("mirror.signs", mirror.signs[None])
-        image = graph.node("Mul", [graph.node("Gather", [obs, columns], axis=1), signs])
-        for side, seen in zip(features, (obs, image)):
-            side.insert(0, graph.layer(encoder.norm, seen, "norm"))
-    return [_joined(graph, side) or "" for side in features]
+        views = [graph.node("Concat", vectors, axis=1)]
+        if mirror is not None:
+            views.append(_vector_image(graph, views[0], mirror))
+        for features, view in zip(sides, views):
+            features.insert(0, graph.layer(encoder.norm, view, "norm"))
+
+    return [_with_entities(graph, encoder, _joined(graph, features), sets) for features in sides]
+
+
+def _vector_image(graph: Any, obs: str, mirror: Mirror) -> str:
+    """Add the mirror image of all vectors ``[batch, O]``."""
+    columns = graph.constant("mirror.columns", mirror.columns, np.int64)
+    signs = graph.constant("mirror.signs", mirror.signs[None])
+    return graph.node("Mul", [graph.node("Gather", [obs, columns], axis=1), signs])
+
+
+def _with_entities(
+    graph: Any, encoder: Encoder, joined: str | None, sets: Sequence[tuple[str, Sequence[int]]]
+) -> str:
+    if encoder.sets is None:
+        assert joined is not None, "a behavior has sensors"
+        return joined
+
+    code = _entities(graph, encoder.sets, joined, sets)
+    return code if joined is None else graph.node("Concat", [joined, code], axis=1)
 
 
 def mirrored_head(mirror: Mirror, head: nn.Linear) -> nn.Linear:
@@ -60,40 +89,6 @@ def mirrored_head(mirror: Mirror, head: nn.Linear) -> nn.Linear:
         joined.weight.copy_(weight)
         joined.bias.copy_(bias)
     return joined
-
-
-def add_sensors(graph: Any, encoder: Encoder, sensors: Sequence[Sequence[int]]) -> str:
-    """Add the inputs and what encodes them; return the name of the features ``[batch, F]``.
-
-    Args:
-        graph: an `onnx_graph.Graph`.
-        encoder: the module.
-        sensors: shape of every sensor, without the batch.
-    """
-    vectors, features, sets = [], [], []
-    images = iter(encoder.images)
-    for index, shape in enumerate(sensors):
-        name = f"obs_{index}"
-        if len(shape) == 1:
-            vectors.append(graph.input(name, shape))
-        elif len(shape) == 2:
-            sets.append((graph.input(name, shape), shape))
-        else:
-            image: Any = next(images)
-            x = graph.input(name, channels_first(shape) if image.channels_last else shape)
-            x = graph.layer(image.conv, x, f"{name}.conv")
-            features.append(graph.layer(image.out, x, f"{name}.out"))
-
-    # The MLP takes the vectors first, wherever their sensors stand.
-    if vectors:
-        features.insert(0, graph.layer(encoder.norm, graph.node("Concat", vectors, axis=1), "norm"))
-    joined = _joined(graph, features)
-    if encoder.sets is None:
-        assert joined is not None, "a behavior has sensors"
-        return joined
-
-    code = _entities(graph, encoder.sets, joined, sets)
-    return code if joined is None else graph.node("Concat", [joined, code], axis=1)
 
 
 def channels_first(shape: Sequence[int]) -> tuple[int, ...]:

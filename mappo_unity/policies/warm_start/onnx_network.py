@@ -64,13 +64,17 @@ class OnnxNetwork:
         }
         if self.state is not None:
             out["memory_size"] = self.state.memory_size
+
+        # the rest only where the file has what it is about, in the order in which it is shown
         if any(part.image is None for part in self.parts):
             out["normalize_obs"] = any(part.mean is not None for part in self.parts)
         if self.actions.mean is not None:
             out["action_distribution"] = "tanh_normal" if self.actions.squashed else "gaussian"
+
         kinds = {part.image.kind for part in self.parts if part.image is not None}
         if len(kinds) == 1 and "" not in kinds:
             out["image_encoder"] = kinds.pop()
+
         if self.actions.init_log_std is not None:
             out["init_log_std"] = self.actions.init_log_std
         if len(self.actions.branch_sizes) > 1:
