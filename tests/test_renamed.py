@@ -6,9 +6,9 @@ from omegaconf import OmegaConf
 from mappo_unity.cli import train_main
 from mappo_unity.config.compose import load_config
 from mappo_unity.config.renamed import rename_keys, rename_lines
-from mappo_unity.config.schema import Activation, CriticKind, LoggerKind, ModelConfig
+from mappo_unity.config.schema import Activation, CriticKind, LoggerKind, MirrorConfig, ModelConfig
 from mappo_unity.policies.policy import model_from_saved
-from mappo_unity.training.resume_check import check_compatible
+from mappo_unity.training.resume_check import check_compatible, describe_models
 
 TINY = [
     *("env=3DBall", "env.num_areas=4", "collect.rounds=16", "model.hidden=[8]", "max_steps=64"),
@@ -50,6 +50,19 @@ def test_a_checkpoint_that_does_not_know_a_model_option_yet_has_its_default(tmp_
     check_compatible(tmp_path, state, "X", {}, {"P": {"hidden": [8], "init_log_std": 0.0}})
     with pytest.raises(ValueError, match=r"model.init_log_std=0.0 there, 1.0 here"):
         check_compatible(tmp_path, state, "X", {}, {"P": {"hidden": [8], "init_log_std": 1.0}})
+
+
+def test_so_has_an_option_within_a_group_of_them(tmp_path):
+    def mirror(**options):
+        return describe_models({"P": ModelConfig(mirror=MirrorConfig(swap=[0, 1, 1], **options))})
+
+    known = mirror()
+    del known["P"]["mirror"]["flip_images"]
+    state = {"env_name": "X", "layout": {}, "model": known}
+    check_compatible(tmp_path, state, "X", {}, mirror())
+    said = r"another network: model.mirror.flip_images=false there, true here$"
+    with pytest.raises(ValueError, match=said):
+        check_compatible(tmp_path, state, "X", {}, mirror(flip_images=True))
 
 
 def test_an_initial_deviation_beyond_todays_range_still_loads(tmp_path):

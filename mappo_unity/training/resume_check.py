@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from mappo_unity.config.option_table import show_value
-from mappo_unity.config.schema import ModelConfig, bounded_log_std
+from mappo_unity.config.schema import ModelConfig
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.policies.layouts import describe_spec, same_layout
+from mappo_unity.policies.policy import model_from_saved
 from mappo_unity.runs.checkpoint import CheckpointError
 from mappo_unity.training.collection.description import Played
 
@@ -41,15 +42,20 @@ def check_compatible(
         )
 
     different = []
-    defaults = plain(asdict(ModelConfig()))
     for name, model in models.items():
         # an option that the checkpoint does not know yet had its default's effect
-        saved = defaults | state["model"][name]
-        saved["init_log_std"] = bounded_log_std(saved["init_log_std"])
-        different += [f"model.{k}={saved[k]} there, {v} here" for k, v in model.items() if saved[k] != v]
+        saved = plain(asdict(model_from_saved(state["model"][name])))
+        different += _differences("model", saved, model)
 
     if different:
         raise CheckpointError(f"checkpoint {path} holds another network: {'; '.join(different)}")
+
+
+def _differences(option: str, there: Any, here: Any) -> list[str]:
+    """Say which options differ, each one of a group for itself."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        return [line for key in here for line in _differences(f"{option}.{key}", there[key], here[key])]
+    return [f"{option}={show_value(there)} there, {show_value(here)} here"] if there != here else []
 
 
 def check_streams(path: Path, saved: dict[str, Any], learners: dict[str, PolicyLearner]) -> None:
