@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -20,6 +23,7 @@ from mappo_unity.learning.networks.mirror import make_mirror
 from mappo_unity.policies.onnx_check import compare
 from mappo_unity.policies.warm_start.actors import copy_network
 from mappo_unity.policies.warm_start.onnx_network import read_network
+from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.scenes.registry import make_scene
 
 # 3 rays of 2 numbers in 2 frames, a pair of columns, a column that changes its sign
@@ -181,6 +185,7 @@ def test_an_onnx_file_plays_as_its_network_and_gives_it_back(tmp_path, kind, lay
     path.write_bytes(data)
     network = read_network(path)
     assert network.options["mirror"] == {
+        "use": True,
         "rays": [0, 3, 2, 2],
         "swap": [12, 13, 1],
         "negate": [14],
@@ -261,6 +266,49 @@ def test_a_run_trains_resumes_and_is_what_others_begin_with(tmp_path, capsys):
     assert "has mirror=(swap=[0, 19, 1, 1, 18, 1, 2, 17, ...] branches=[0, 2, 1]): leave" in said
 
 
+def test_what_a_preset_describes_can_be_left_aside():
+    config = compose_config(["env=Walker", "model.mirror.use=false", "model.memory=lstm"]).config
+    assert config.model.mirror.swap and not config.model.mirror.is_used
+    assert make_mirror(config.model.mirror, ObsLayout(243), ActionLayout(39, ())) is None
+
+
+def test_what_a_preset_says_of_a_behavior_gives_way_to_its_file(tmp_path):
+    """A user's options contradict a file, a preset's do not; which are whose, the command line tells."""
+    plain, mirrored = str(tmp_path / "plain.onnx"), str(tmp_path / "mirrored.onnx")
+    mirror = {"rays": [0, 3, 2, 1], "branches": [0, 2, 1]}
+    Path(plain).write_bytes(data_of(make([[6]], 0, [3]), [[6]]))
+    Path(mirrored).write_bytes(data_of(make([[6]], 0, [3], mirror=MirrorConfig(**mirror)), [[6]]))
+    given = "behaviors.Goalie.model.mirror.rays=[0,3,2,1]"
+
+    def adopted(*lines, **options):
+        behaviors = {"Goalie": {"model": {"mirror": mirror}, **options}}
+        config = compose_config(["env=StrikersVsGoalie", *lines]).config
+        config = adopt_file_options(replace(config, behaviors=behaviors), list(lines))
+        return behavior_config(config, "Goalie").model
+
+    assert not adopted(init_from=plain).mirror.is_used
+    assert not adopted(f"init_from={plain}").mirror.is_used
+    assert adopted(f"init_from={plain}", init_from=None).mirror == MirrorConfig(**mirror)
+    assert adopted(
+        f"init_from={mirrored}", given, "behaviors.Goalie.model.mirror.branches=[0,2,1]"
+    ).mirror.rays
+    assert not adopted(f"init_from={plain}", "model.mirror.use=false").mirror.is_used
+    assert adopted(f"init_from={mirrored}", "recipe=mappo_paper").mirror.is_used
+
+    for lines, options in (([given], {"init_from": plain}), ([f"init_from={plain}", given], {})):
+        with pytest.raises(
+            ConfigError, match=r"behaviors.Goalie.model.mirror=\(rays=\[0, 3, 2, 1\] .* contra"
+        ):
+            adopted(*lines, **options)
+    with pytest.raises(ConfigError, match=r"model.mirror=none contradicts .*mirrored.onnx"):
+        adopted(f"init_from={mirrored}", "model.mirror.use=false")
+    for mistake in ("mirror=5", "mirror.ray=[0]"):
+        lines = [f"init_from={plain}", f"behaviors.Goalie.model.{mistake}"]
+        config = compose_config(["env=StrikersVsGoalie", *lines]).config
+        with pytest.raises(ConfigError, match=r"^behaviors.Goalie.model.mirror=.* options among use, rays"):
+            adopt_file_options(config, lines)
+
+
 # --- mistakes
 
 
@@ -308,6 +356,7 @@ def test_what_is_no_mirror_image_is_refused(options, message):
             "flip_images=true has no effect: there are no images",
         ),
         (["env=Basic", BASIC, "model.memory=lstm"], "model.mirror needs model.memory=none, not lstm"),
+        (["env=Walker", "model.memory=gru"], "not known; model.mirror.use=false does without"),
         (["env=Basic", BASIC, "model.critic=poca"], "not poca: its baseline sees actions"),
         ([*SOCCER, "model.flatten_branches=true"], "needs model.flatten_branches=false, not true"),
     ],

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.config.per_behavior import behavior_config
 from mappo_unity.config.presets import conf_dir
 from mappo_unity.config.schema import (
     CriticKind,
@@ -119,7 +120,8 @@ def test_the_official_learner_is_whole_whatever_the_preset_says(scene):
     assert {k: v for k, v in ppo.items() if k not in own} == {
         k: v for k, v in expected.items() if k not in own
     }
-    own = {"hidden", "critic", "normalize_obs", "memory", "memory_size"}
+    assert not any(model.mirror.is_used for model in models_of(config))
+    own = {"hidden", "critic", "normalize_obs", "memory", "memory_size", "mirror"}
     model, expected = asdict(config.model), asdict(bare.model)
     assert {k: v for k, v in model.items() if k not in own} == {
         k: v for k, v in expected.items() if k not in own
@@ -134,6 +136,18 @@ def test_a_recipe_s_networks_are_the_same_for_every_preset(recipe, scene):
     config = composed(f"recipe={recipe}", f"env={scene}")
     bare = composed(f"recipe={recipe}", "env=unity", "env.file_name=Game")
     assert config.model == bare.model
+
+
+@pytest.mark.parametrize("recipe", ["mappo_paper", "benchmarl"])
+@pytest.mark.parametrize("scene", ["Walker", "StrikersVsGoalie"])
+def test_a_recipe_has_no_mirror_whatever_the_preset_says(recipe, scene):
+    config = composed(f"recipe={recipe}", f"env={scene}")
+    assert not any(model.mirror.is_used for model in models_of(config))
+
+
+def models_of(config):
+    """Return the options of the networks, of all behaviors and of each that has its own."""
+    return [config.model, *(behavior_config(config, name).model for name in config.behaviors)]
 
 
 def test_what_makes_the_recipes_differ():

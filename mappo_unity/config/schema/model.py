@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
 from typing import Any, Optional
 
@@ -79,6 +79,10 @@ def bounded_log_std(value: float) -> float:
     return min(max(value, LOG_STD_RANGE[0]), LOG_STD_RANGE[1])
 
 
+WITHOUT_MIRROR = "model.mirror.use=false does without"
+"""What to do where networks cannot mirror."""
+
+
 @dataclass
 class MirrorConfig:
     """What an agent senses and does, in a mirror that exchanges left and right; with nothing given: unused.
@@ -87,6 +91,9 @@ class MirrorConfig:
     it acts in the mirror image of a situation as the mirror image of how it acts in that situation.
     """
 
+    use: bool = True
+    """Whether networks mirror, where a mirror image is described; false: presets' descriptions are left
+    aside."""
     rays: list[int] = field(default_factory=list)
     """Ray sensors of Unity, four numbers each: first column, rays, numbers of a ray (tags + 2), stacked
     frames; rays to the right and to the left change places."""
@@ -125,12 +132,18 @@ class MirrorConfig:
     @property
     def is_used(self) -> bool:
         """Whether there is a mirror image."""
-        return self.flip_images or any(self.lists().values())
+        return self.use and (self.flip_images or any(self.lists().values()))
+
+    @property
+    def in_effect(self) -> MirrorConfig:
+        """What of it matters: itself, or nothing where it is not used."""
+        return self if self.is_used else MirrorConfig()
 
 
 def show_mirror(options: dict[str, Any]) -> str:
     """Return what is given of `MirrorConfig`, which stands there as plain values, in a few words."""
-    given = {name: value for name, value in options.items() if value}
+    given = {name: value for name, value in asdict(MirrorConfig(**options).in_effect).items() if value}
+    given.pop("use", None)
     shown = (f"{name}={'true' if value is True else show_numbers(value)}" for name, value in given.items())
     return f"({' '.join(shown)})" if given else "none"
 
@@ -225,12 +238,12 @@ class ModelConfig:
             if value != needed:
                 raise ConfigError(
                     f"model.mirror needs model.{option}={_show(needed)}, not {_show(value)}: what that looks "
-                    "like in a mirror is not known"
+                    f"like in a mirror is not known; {WITHOUT_MIRROR}"
                 )
         if self.critic is CriticKind.poca:
             raise ConfigError(
                 "model.mirror needs model.critic=local, central, mean or attention, not poca: its baseline "
-                "sees actions, which are not mirrored there"
+                f"sees actions, which are not mirrored there; {WITHOUT_MIRROR}"
             )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection
-from dataclasses import asdict, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from mappo_unity.config.option_table import show_value
 from mappo_unity.config.options_file import file_root
-from mappo_unity.config.overrides import given_options
+from mappo_unity.config.overrides import given_options, parse
 from mappo_unity.config.schema import Config, MirrorConfig, ModelConfig, show_mirror
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.policy_files import Kind, Source, check_checkpoint, locate
@@ -54,6 +54,8 @@ def adopt_file_options(config: Config, lines: list[str], file: Path | None = Non
     if file is not None:
         given |= set(file_root(file, lines).get("model") or {})
 
+    given_to_behaviors = _given_to_behaviors(lines, file)
+
     behaviors = copy.deepcopy(config.behaviors)
     shape = _shape_of(config.init_from, "init_from")
     model = _adopted(config.model, shape, given, "model", str(config.init_from))
@@ -63,17 +65,40 @@ def adopt_file_options(config: Config, lines: list[str], file: Path | None = Non
             continue  # `behavior_config` says what is wrong with it
         option = f"behaviors.{name}"
         theirs = dict(own.get("model") or {})
+        given_to_it = {key: value for key, value in theirs.items() if (name, key) in given_to_behaviors}
         if "init_from" in own:
             # what the file of the other behaviors changed is not meant for this one
             back = {key: _plain(getattr(config.model, key)) for key in shape if key not in theirs}
             shape_of_own = _shape_of(own["init_from"], f"{option}.init_from")
-            _check_given(theirs, shape_of_own, f"{option}.model", str(own["init_from"]))
+            _check_given(given_to_it, shape_of_own, f"{option}.model", str(own["init_from"]))
             if shape or shape_of_own:
                 own["model"] = back | theirs | shape_of_own
         else:
-            _check_given(theirs, shape, f"{option}.model", str(config.init_from))
+            _check_given(given_to_it, shape, f"{option}.model", str(config.init_from))
+            if shape:
+                own["model"] = {key: value for key, value in theirs.items() if key not in shape}
 
     return replace(config, model=model, behaviors=behaviors)
+
+
+def _given_to_behaviors(lines: list[str], file: Path | None) -> set[tuple[str, str]]:
+    """Return the model options that the user, and no preset, gave to behaviors: names of both."""
+    trees = [] if file is None else [file_root(file, lines).get("behaviors") or {}]
+    for line in parse(lines):
+        first, *names = line.key_or_group.split(".")
+        value = line.value()
+        for name in reversed(names):
+            value = {name: value}
+        if first == "behaviors" and isinstance(value, dict):
+            trees.append(value)
+
+    return {
+        (str(name), key)
+        for tree in trees
+        for name, own in tree.items()
+        if isinstance(own, dict) and isinstance(own.get("model"), dict)
+        for key in own["model"]
+    }
 
 
 def _shape_of(where: Any, option: str) -> dict[str, Any]:
@@ -114,7 +139,8 @@ def _check_given(given: dict[str, Any], shape: dict[str, Any], where: str, path:
             continue
         value = _plain(value)
         if key == MIRROR:
-            value = _plain(MirrorConfig()) | value  # of a behavior only what is given stands there
+            # of a behavior only what is given stands there
+            value = _plain(_mirror(value, f"{where}.{key}").in_effect)
 
         if value != shape[key]:
             own, theirs = (show_mirror(v) if key == MIRROR else show_value(v) for v in (value, shape[key]))
@@ -122,6 +148,13 @@ def _check_given(given: dict[str, Any], shape: dict[str, Any], where: str, path:
                 f"{where}.{key}={own} contradicts {path}, whose network has {key}={theirs}: leave the option "
                 "out, and it is taken from the file"
             )
+
+
+def _mirror(value: Any, where: str) -> MirrorConfig:
+    names = [field.name for field in fields(MirrorConfig)]
+    if not isinstance(value, dict) or not value.keys() <= set(names):
+        raise ConfigError(f"{where}={show_value(value)} must hold options among {', '.join(names)}")
+    return MirrorConfig(**value)
 
 
 def _plain(value: Any) -> Any:
