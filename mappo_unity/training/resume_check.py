@@ -42,10 +42,10 @@ def check_compatible(
         )
 
     different = []
+    # an option that the checkpoint does not know yet had its default's effect
+    saved = describe_models({name: model_from_saved(state["model"][name]) for name in models})
     for name, model in models.items():
-        # an option that the checkpoint does not know yet had its default's effect
-        saved = plain(asdict(model_from_saved(state["model"][name])))
-        different += _differences("model", saved, model)
+        different += _differences("model", saved[name], model)
 
     if different:
         raise CheckpointError(f"checkpoint {path} holds another network: {'; '.join(different)}")

@@ -142,8 +142,8 @@ class MirrorConfig:
 
 def show_mirror(options: dict[str, Any]) -> str:
     """Return what is given of `MirrorConfig`, which stands there as plain values, in a few words."""
-    given = {name: value for name, value in asdict(MirrorConfig(**options).in_effect).items() if value}
-    given.pop("use", None)
+    mirror = asdict(MirrorConfig(**options).in_effect)
+    given = {name: value for name, value in mirror.items() if value and name != "use"}
     shown = (f"{name}={'true' if value is True else show_numbers(value)}" for name, value in given.items())
     return f"({' '.join(shown)})" if given else "none"
 

@@ -51,10 +51,9 @@ def adopt_file_options(config: Config, lines: list[str], file: Path | None = Non
         ConfigError: a given option contradicts a file, or there is no such file or checkpoint.
     """
     given = {name.split(".")[1] for name in given_options(lines) if name.startswith("model.")}
-    if file is not None:
-        given |= set(file_root(file, lines).get("model") or {})
-
-    given_to_behaviors = _given_to_behaviors(lines, file)
+    root = {} if file is None else file_root(file, lines)
+    given |= set(root.get("model") or {})
+    given_to_behaviors = _given_to_behaviors(lines, root.get("behaviors") or {})
 
     behaviors = copy.deepcopy(config.behaviors)
     shape = _shape_of(config.init_from, "init_from")
@@ -81,9 +80,9 @@ def adopt_file_options(config: Config, lines: list[str], file: Path | None = Non
     return replace(config, model=model, behaviors=behaviors)
 
 
-def _given_to_behaviors(lines: list[str], file: Path | None) -> set[tuple[str, str]]:
+def _given_to_behaviors(lines: list[str], of_file: dict[str, Any]) -> set[tuple[str, str]]:
     """Return the model options that the user, and no preset, gave to behaviors: names of both."""
-    trees = [] if file is None else [file_root(file, lines).get("behaviors") or {}]
+    trees = [of_file]
     for line in parse(lines):
         first, *names = line.key_or_group.split(".")
         value = line.value()
