@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
 import sys
 import time
 from collections.abc import Callable
@@ -17,6 +18,7 @@ import numpy as np
 
 from mappo_unity.protocol import encode, messages
 from mappo_unity.protocol.serve import Player, env_function
+from mappo_unity.protocol.side_channels import ENGINE, STATISTICS
 from mappo_unity.scenes.ball3d.scene import Ball3D
 
 
@@ -54,6 +56,10 @@ def misbehave(mode: str, after: int, exchange: Callable[[bytes], bytes]) -> Call
             sys.exit(0)
         if mode == "silent":  # answers, but no agent ever asks
             return exchange(messages.message(messages.STATUS_OK, unity_output=encode.output({})))
+        if mode in ("statistics", "engine"):  # cut short; on a channel that only the trainer writes to
+            channel, content = (STATISTICS, b"\1\0\0\0a\0\0") if mode == "statistics" else (ENGINE, b"")
+            side = channel.bytes_le + struct.pack("<i", len(content)) + content
+            return exchange(messages.message(messages.STATUS_OK, unity_output=encode.output({}, None, side)))
         if mode == "version":
             hello = b"".join(
                 messages.delimited(field, text) for field, text in ((1, b"Old"), (2, b"2.0.0"), (7, b"9.9.9"))

@@ -82,6 +82,12 @@ def text_action() -> Script:
     return Script(action=spaces.Text(9))
 
 
+def no_spaces() -> Script:
+    env = Script()
+    del env.spaces
+    return env
+
+
 def wrong_masks() -> Script:
     env = Script()
     env.infos = lambda agents: {a: {"action_mask": np.ones(4, np.int8)} for a in agents}

@@ -138,8 +138,8 @@ class TestPlayer:
             process.kill()
             act_and_step(players)
             assert players.restarts == 1
-        for number in range(2):
-            assert "environment parameter scale = 3" in (tmp_path / f"logs/Player-{number}.log").read_text()
+        for log in ("Player-0.log", "Player-1-restart-1.log"):
+            assert "environment parameter scale = 3" in (tmp_path / "logs" / log).read_text()
 
     def test_the_same_seed_gives_the_embedded_trajectory(self, build: str, tmp_path: Path) -> None:
         player = make_env_function(options(build, tmp_path, params={"mass": 2.0}))(7)
@@ -231,6 +231,8 @@ class TestFailures:
             ("close", "closed the connection: Academy was destroyed"),
             ("malformed", "sent a malformed message of 4 bytes"),
             ("nan", "agent 1: its sensor obs_0 holds nan"),
+            ("statistics", "sent a malformed message"),
+            ("engine", "sent a malformed message"),
         ],
     )
     def test_it_is_restarted_and_its_episodes_are_cut_off(
@@ -263,7 +265,9 @@ class TestFailures:
         np.testing.assert_array_equal(decision.obs[0], fresh.get_steps(BALL)[0].obs[0])
         assert not np.array_equal(decision.obs[0], first.obs[0])
         assert re.search(words, caplog.text) and "restart 1 of at most 1" in caplog.text
-        assert str(tmp_path / "logs" / "Player-0.log") in caplog.text
+        logs = tmp_path / "logs"
+        assert f"its log: {logs / 'Player-0.log'}" in caplog.text
+        assert {log.name for log in logs.glob("*.log")} == {"Player-0.log", "Player-0-restart-1.log"}
         act_and_step(env)
         assert not env.crashed_agents and not len(env.get_steps(BALL)[1])
         with pytest.raises(
@@ -580,6 +584,12 @@ class TestCustom:
         with pytest.raises(ConfigError, match="env.params.seed=3: .* use seed=N$"):
             make_env_function(cfg)
 
+    def test_the_number_of_areas_is_no_parameter_of_a_scene(self) -> None:
+        with pytest.raises(
+            ConfigError, match="env.params.num_areas=3 is no parameter .* use env.num_areas=N$"
+        ):
+            make_env_function(EnvConfig(name="Basic", params={"num_areas": 3}))
+
     def test_a_failure_of_its_own_passes(self) -> None:
         cfg = EnvConfig(backend=Backend.custom, factory="test_backend:refuse", params={"size": 2})
         with pytest.raises(EnvironmentFailure, match="^the simulator is gone$"):
@@ -669,6 +679,32 @@ class TestOptions:
                 {"backend": Backend.editor, "params": {"mass": "big"}},
                 "env.params.mass=big must be a number, a sampler",
             ),
+            (
+                {"backend": Backend.editor, "params": {"größe": 1}},
+                "env.params.größe: players only know names",
+            ),
+            (
+                {"backend": Backend.editor, "params": {"mass": -1e39}},
+                r"env.params.mass: -1e\+39 is out of range",
+            ),
+            (
+                {
+                    "backend": Backend.editor,
+                    "params": {
+                        "mass": {
+                            "lessons": [
+                                {"value": 1, "completion": {"threshold": 1}},
+                                {"value": {"sampler": "gaussian", "mean": 0, "st_dev": 1e40}},
+                            ]
+                        }
+                    },
+                },
+                r"env.params.mass: 1e\+40 is out of range: players take numbers \(float32\)",
+            ),
+            ({"time_scale": 1e39}, r"env.time_scale=1e\+39 is out of range"),
+            ({"screen_width": 2**31, "screen_height": 9}, "env.screen_width=2147483648 is out of range"),
+            ({"target_frame_rate": 2**31}, "env.target_frame_rate=2147483648 is out of range"),
+            ({"quality_level": 2**31}, "env.quality_level=2147483648 is out of range"),
         ],
     )
     def test_options_that_cannot_be(self, fields: dict[str, Any], words: str) -> None:

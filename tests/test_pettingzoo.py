@@ -165,6 +165,31 @@ def test_pictures(shape: Any, kept: Any, marks: Any) -> None:
     assert sensor.read(np.full(shape, 255, np.uint8)).max() == 1
 
 
+@pytest.mark.parametrize(
+    ("space", "value"),
+    [
+        (spaces.Box(0, 255, (4, 5, 3), np.uint8), np.full((4, 5, 3), 0.7)),
+        (spaces.Box(0, 255, (4, 5, 3), np.uint8), np.full((4, 5, 3), 300)),
+        (spaces.Discrete(4), -1),
+        (spaces.Discrete(4, start=2), 6),
+        (spaces.MultiDiscrete([2, 3]), [2, 0]),
+    ],
+)
+def test_observations_outside_their_space_are_refused(space: Any, value: Any) -> None:
+    (sensor,) = read_sensors(space, "x")
+    with pytest.raises(ValueError, match="numbers"):
+        sensor.read(value)
+
+
+def test_agents_with_other_spaces_are_another_behavior() -> None:
+    script = parallel_probe.Script()
+    script.spaces["runner_1"] = spaces.Box(-5, 5, (2,), np.float32)  # the same sensor in ML-Agents' words
+    env = make(factory=lambda: script)
+    env.reset()
+    assert set(env.behavior_specs) == {"runner", "runner_b", "helper"}
+    env.close()
+
+
 def test_hybrid_actions() -> None:
     space = spaces.Dict(
         {
@@ -208,6 +233,7 @@ def test_it_trains_resumes_and_is_evaluated(tmp_path: Any, capsys: Any) -> None:
         (["env.factory=parallel_probe:no_env"], ["returned a dict", "must return a pettingzoo.ParallelEnv"]),
         (["env.factory=parallel_probe:text_observation"], ["'runner_0'", "news = Text(", "no sensor"]),
         (["env.factory=parallel_probe:text_action"], ["'runner_0'", "action space has Text("]),
+        (["env.factory=parallel_probe:no_spaces"], ["raised AttributeError", "in observation_space"]),
         (["env.factory=parallel_probe:no_agents"], ["possible_agents is empty"]),
         (
             ["env.factory=parallel_probe:wrong_masks"],

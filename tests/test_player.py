@@ -202,6 +202,32 @@ class TestWire:
             other = BehaviorSpec([vector_spec(4), vector_spec(2)], MIXED.action_spec)
             decode.BehaviorDecoder("B", other).decode(infos)
 
+    @pytest.mark.parametrize(
+        "spoil", [lambda png: png[1:], lambda png: png[: len(png) // 2], lambda png: b"a\nb" * 60]
+    )
+    def test_broken_pictures_are_refused(self, spoil: Any) -> None:
+        steps = random_steps(1, PICTURE, np.random.default_rng(2))
+        rows = encode.BehaviorEncoder("B", PICTURE).encode(steps, TerminalSteps.empty(PICTURE))
+        data = messages.message(200, unity_output=encode.output({"B": rows}))
+        (info,) = messages.parse(data).unity_output.rl_output.agentInfos["B"].value
+        png = next(o.compressed_data for o in info.observations if o.compression_type == messages.PNG)
+        assert decode._pixels(png, []).ndim == 3
+        with pytest.raises(decode.MalformedMessage, match="a picture of .* cannot be decoded"):
+            decode._pixels(spoil(png), [])
+
+    def test_a_narrow_picture_is_not_grey(self) -> None:
+        shape = (3, 40, 1)
+        marks = (DimensionProperty.NONE, *[DimensionProperty.TRANSLATIONAL_EQUIVARIANCE] * 2)
+        spec = BehaviorSpec([ByteImage(shape, marks, ObservationType.DEFAULT, "bar")], ActionSpec(1, ()))
+        steps = random_steps(2, spec, np.random.default_rng(2))
+        steps.obs[0][:] = np.rint(steps.obs[0].clip(0, 1) * 255) / np.float32(255)
+        rows = encode.BehaviorEncoder("B", spec).encode(steps, TerminalSteps.empty(spec))
+        data = messages.message(200, unity_output=encode.output({"B": rows}))
+        infos = messages.parse(data).unity_output.rl_output.agentInfos["B"].value
+        assert infos[0].observations[0].compression_type == messages.PNG
+        decision, _ = decode.BehaviorDecoder("B", spec).decode(infos)
+        np.testing.assert_allclose(decision.obs[0], steps.obs[0], rtol=1e-6)
+
     def test_huge_but_finite_numbers_pass(self) -> None:
         steps = random_steps(2, MIXED, np.random.default_rng(2))
         steps.obs[0][:] = 3e38  # their sum overflows float32

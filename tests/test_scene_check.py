@@ -168,6 +168,15 @@ def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
         in out
     )
     assert main(["3DBall", "env.params.mass=2", "--steps", "5"]) == 0
+    sampler = "env.params.mass={sampler: uniform, min: 1, max: 5}"
+    assert main(["3DBall", sampler, "--steps", "5"]) == 0
     capsys.readouterr()
+    for line, words in (
+        ("env.params.seed=3", "use --seed=N"),
+        ("env.params.num_areas=2", "use --num-areas=N"),
+        ("env.params.mas=2", "mass"),
+    ):
+        assert main(["3DBall", line]) == 2
+        assert words in capsys.readouterr().err
     assert main(["4DBall"]) == 2
     assert "choices: 3DBall" in capsys.readouterr().err

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
+from mappo_unity.config.option_table import show_value
 from mappo_unity.config.parameters.values import later_values, values_at
 from mappo_unity.config.schema import Backend, EnvConfig
 from mappo_unity.errors import ConfigError
@@ -53,6 +55,12 @@ def make_env_function(cfg: EnvConfig, log_folder: Path | None = None, is_trainin
 def _embedded(cfg: EnvConfig, is_staggered: bool) -> MakeEnv:
     from mappo_unity.scenes.registry import BUILT_IN, make_scene
 
+    if "num_areas" in cfg.params:
+        raise ConfigError(
+            f"env.params.num_areas={show_value(cfg.params['num_areas'])} is no parameter of a scene, but an "
+            "option of its own: use env.num_areas=N"
+        )
+
     parameters = cfg.parameters
     params = values_at(parameters, {})
     if cfg.num_areas is not None:
@@ -80,10 +88,10 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
     executable = find_player(cfg)
     folder = _log_folder(cfg, log_folder)
 
-    def options(number: int) -> PlayerOptions:
+    def options(log_name: str) -> PlayerOptions:
         return PlayerOptions(
             executable,
-            folder / f"Player-{number}.log",
+            folder / log_name,
             # only the Editor must be told its port; for players the system picks a free one (0)
             port=cfg.port or EDITOR_PORT if cfg.backend is Backend.editor else 0,
             timeout_s=cfg.timeout_s,
@@ -98,7 +106,16 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
         name = f"player {number}" if cfg.num_players > 1 else _describe(cfg)
         # a player's seed is an int32 that is not negative
         first = (seed + PLAYER_STRIDE * number) % 2**31
-        return RestartingPlayer(lambda s: UnityPlayer(options(number), s), first, cfg.max_restarts, name)
+
+        # Every restart has a log of its own: messages name that of the player that failed.
+        restarts = count()
+
+        def make_player(own_seed: int) -> UnityPlayer:
+            restart = next(restarts)
+            log_name = f"Player-{number}-restart-{restart}.log" if restart else f"Player-{number}.log"
+            return UnityPlayer(options(log_name), own_seed)
+
+        return RestartingPlayer(make_player, first, cfg.max_restarts, name)
 
     def make(seed: int) -> BaseEnv:
         players: list[RestartingPlayer] = []

@@ -9,12 +9,13 @@ which the player is gone; `RestartingPlayer` starts another.
 from __future__ import annotations
 
 import logging
+import struct
 from collections.abc import Callable
 from typing import Any
 
 from mlagents_envs import __version__ as MLAGENTS_VERSION
 from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorMapping, DecisionSteps, TerminalSteps
-from mlagents_envs.exception import UnityActionException, UnityEnvironmentException
+from mlagents_envs.exception import UnityActionException, UnityEnvironmentException, UnityException
 from mlagents_envs.side_channel import SideChannel
 
 from mappo_unity.config.parameters.samplers import Value
@@ -137,7 +138,7 @@ class UnityPlayer(BaseEnv):
             }
             if output.rl_output.side_channel:
                 self._channels.process_side_channel_message(output.rl_output.side_channel)
-        except (MalformedMessage, UnityEnvironmentException, ValueError, IndexError) as error:
+        except (MalformedMessage, UnityException, struct.error, ValueError, IndexError) as error:
             raise self._failure(f"sent a malformed message: {error}") from error
 
     def set_parameter(self, name: str, value: Value) -> None:

@@ -101,7 +101,9 @@ class BehaviorDecoder:
         shape = tuple(self.spec.observation_specs[index].shape)
         image = _pixels(observation.compressed_data, list(observation.compressed_channel_mapping))
 
-        if 1 in (shape[0], shape[2]) and image.shape[2] == 3:  # grey, sent as a colour picture
+        # Grey is sent as a colour picture. A width of 1 does not make a sensor grey.
+        height, width, planes = image.shape
+        if planes == 3 and shape in ((1, height, width), (height, width, 1)):
             image = image.mean(axis=2, keepdims=True)
 
         # Both ways where all sizes are equal; then the sensor says which it is.
@@ -236,7 +238,6 @@ def _pixels(data: bytes, mapping: list[int]) -> np.ndarray:
     `mapping`: for every plane of the pictures the channel that it belongs to, -1 for none; planes of one
     channel are averaged (ML-Agents, CompressionSpec).
     """
-    from mlagents_envs.exception import UnityException
     from mlagents_envs.rpc_utils import OffsetBytesIO
     from PIL import Image
 
@@ -245,13 +246,13 @@ def _pixels(data: bytes, mapping: list[int]) -> np.ndarray:
     try:
         while start >= 0:
             stream.offset = start
-            image = Image.open(stream)
+            image = Image.open(stream, formats=["PNG"])
             image.load()
             array = np.array(image, np.float32) / np.float32(255)
             planes.append(array[:, :, None] if array.ndim == 2 else array)
             start = data.find(header, stream.original_tell())
         picture = np.concatenate(planes, axis=2)
-    except (OSError, SyntaxError, ValueError, UnityException) as error:
+    except Exception as error:  # of many kinds, by what is broken
         raise MalformedMessage(f"a picture of {len(data)} bytes cannot be decoded: {error}") from error
 
     if not mapping:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from traceback import TracebackException
 from typing import Any
@@ -39,12 +40,8 @@ def call_factory(factory: Callable[..., Any], name: str, seed: int, params: Mapp
     # First, so that a TypeError from within the factory is not taken for a wrong parameter.
     check_call(factory, name, params)
 
-    try:
+    with explained(name):
         env = factory(seed=seed, **params)
-    except (ConfigError, EnvironmentFailure):
-        raise
-    except (Exception, SystemExit) as error:
-        raise explain_error(error, name) from error
 
     if not isinstance(env, BaseEnv):
         raise ConfigError(
@@ -107,6 +104,20 @@ def check_factory(cfg: EnvConfig) -> None:
     """Raise ConfigError if env.factory is given and cannot be imported, or is no function."""
     if cfg.factory is not None:
         load_factory(cfg.factory, f"env.factory={cfg.factory}")
+
+
+@contextmanager
+def explained(who: str) -> Iterator[None]:
+    """Let a user's code run: what it raises becomes a ConfigError (see `explain_error`).
+
+    A ConfigError and an EnvironmentFailure of its own pass.
+    """
+    try:
+        yield
+    except (ConfigError, EnvironmentFailure):
+        raise
+    except (Exception, SystemExit) as error:
+        raise explain_error(error, who) from error
 
 
 def explain_error(error: BaseException, who: str) -> ConfigError:

@@ -11,6 +11,7 @@ from mappo_unity.config.parameters.curriculum import Curriculum, is_curriculum, 
 from mappo_unity.config.parameters.samplers import (
     KINDS,
     Sampler,
+    Value,
     is_sampler,
     read_number,
     read_value,
@@ -20,6 +21,8 @@ from mappo_unity.errors import ConfigError
 
 PLAYERS, SCENE, FACTORY = "players", "scene", "factory"
 """What takes the parameters; `read_parameters` looks at each differently."""
+LARGEST_FLOAT32 = (2 - 2**-23) * 2.0**127
+"""Players take numbers of 32 bits."""
 
 
 def read_parameters(params: Mapping[str, Any], taker: str) -> dict[str, Any]:
@@ -32,6 +35,10 @@ def read_parameters(params: Mapping[str, Any], taker: str) -> dict[str, Any]:
         ConfigError: a mistake in one of them.
     """
     read = {name: _read(f"env.params.{name}", raw, taker) for name, raw in params.items()}
+    if taker == PLAYERS:
+        for name, value in read.items():
+            _check_sendable(name, value)
+
     orders = iter(range(len(params) + sum(len(c.lessons) for c in read.values() if _is_curriculum(c))))
     return {name: _ordered(value, orders) for name, value in read.items()}
 
@@ -103,6 +110,25 @@ def _read(where: str, raw: Any, taker: str) -> Any:
     if taker == PLAYERS:
         return read_number(where, raw, _WANTED)
     return raw
+
+
+def _check_sendable(name: str, value: Value | Curriculum) -> None:
+    """Raise ConfigError for what the side channel to players cannot carry: ASCII and float32."""
+    if not name.isascii():
+        raise ConfigError(
+            f"env.params.{name}: players only know names of ASCII characters, that is of letters without "
+            "accents, digits and signs"
+        )
+
+    values = [lesson.value for lesson in value.lessons] if isinstance(value, Curriculum) else [value]
+    for each in values:
+        numbers = each.numbers if isinstance(each, Sampler) else [each]
+        for number in numbers:
+            if abs(number) > LARGEST_FLOAT32:
+                raise ConfigError(
+                    f"env.params.{name}: {number:g} is out of range: players take numbers (float32) from "
+                    f"-{LARGEST_FLOAT32:.3g} to {LARGEST_FLOAT32:.3g}"
+                )
 
 
 _WANTED = "a number, a sampler {sampler: ...} or a curriculum {lessons: [...]}: players take no others"

@@ -26,9 +26,14 @@ def above(option: str, value: float | None, low: float) -> None:
     rule(option, value, value is None or value > low, f"must be > {low}")
 
 
-def within(option: str, value: float, low: float, high: float) -> None:
+def at_most(option: str, value: float | None, high: float) -> None:
+    """Refuse a number above a bound."""
+    rule(option, value, value is None or value <= high, f"must be <= {high:g}")
+
+
+def within(option: str, value: float | None, low: float, high: float) -> None:
     """Refuse a number outside a range; both ends belong to it."""
-    rule(option, value, low <= value <= high, f"must be from {low} to {high}")
+    rule(option, value, value is None or low <= value <= high, f"must be from {low} to {high}")
 
 
 def between(option: str, value: float, low: float, high: float) -> None:

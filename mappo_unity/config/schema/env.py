@@ -7,8 +7,14 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Optional
 
-from mappo_unity.config.parameters.values import FACTORY, PLAYERS, SCENE, read_parameters
-from mappo_unity.config.schema.checks import above, at_least, within
+from mappo_unity.config.parameters.values import (
+    FACTORY,
+    LARGEST_FLOAT32,
+    PLAYERS,
+    SCENE,
+    read_parameters,
+)
+from mappo_unity.config.schema.checks import above, at_least, at_most, within
 from mappo_unity.errors import ConfigError
 
 
@@ -23,6 +29,7 @@ class Backend(Enum):
     registry = "registry"
 
 
+LARGEST_INT32 = 2**31 - 1
 BACKENDS = "backends"
 """Metadata of an option of env: the backends that look at it; without it all do."""
 _STARTED = {BACKENDS: (Backend.player, Backend.registry)}
@@ -105,12 +112,13 @@ class EnvConfig:
         at_least("env.max_restarts", self.max_restarts, 0)
         above("env.timeout_s", self.timeout_s, 0)
         above("env.time_scale", self.time_scale, 0)
-        at_least("env.quality_level", self.quality_level, 0)
-        at_least("env.screen_width", self.screen_width, 1)
-        at_least("env.screen_height", self.screen_height, 1)
-        at_least("env.target_frame_rate", self.target_frame_rate, -1)
-        if self.port is not None:
-            within("env.port", self.port, 1, 65535)
+        # what the engine is told has 32 bits
+        at_most("env.time_scale", self.time_scale, LARGEST_FLOAT32)
+        within("env.quality_level", self.quality_level, 0, LARGEST_INT32)
+        within("env.screen_width", self.screen_width, 1, LARGEST_INT32)
+        within("env.screen_height", self.screen_height, 1, LARGEST_INT32)
+        within("env.target_frame_rate", self.target_frame_rate, -1, LARGEST_INT32)
+        within("env.port", self.port, 1, 65535)
 
         self._check_players()
         _ = self.parameters  # which looks for mistakes

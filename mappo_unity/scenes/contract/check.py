@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
+from mappo_unity.config.parameters.values import values_at
 from mappo_unity.config.ranges import check_range
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.scenes import make_scene, scene_names
@@ -197,9 +198,10 @@ def _maker(options: argparse.Namespace) -> Callable[[], BaseEnv]:
     """Return what makes the environment that the command line names; raises ConfigError."""
     check_range("--steps", options.steps, 1)
     check_range("--seed", options.seed, 0)
-    params = _params(options.params)
+    is_factory = ":" in options.scene
+    params = _params(options.params, is_factory)
 
-    if ":" not in options.scene:
+    if not is_factory:
         return lambda: make_scene(options.scene, seed=options.seed, num_areas=options.num_areas, **params)
 
     if options.num_areas is not None:
@@ -209,7 +211,7 @@ def _maker(options: argparse.Namespace) -> Callable[[], BaseEnv]:
     return lambda: call_factory(factory, options.scene, options.seed, params)
 
 
-def _params(lines: list[str]) -> dict[str, Any]:
+def _params(lines: list[str], is_factory: bool) -> dict[str, Any]:
     """Return the parameters of env.params.NAME=VALUE, read as mappo-train reads them; raises ConfigError."""
     from mappo_unity.config.compose import compose_config
 
@@ -219,8 +221,15 @@ def _params(lines: list[str]) -> dict[str, Any]:
     if not lines:
         return {}
 
-    # The factory is a stand-in that nobody loads: only the parameters are read.
-    return dict(compose_config(["env=custom", "env.factory=any:one", *lines]).config.env.params)
+    # Stand-ins that nobody opens: only the parameters are read. Curricula are at their first lessons.
+    taker = ["env=custom", "env.factory=any:one"] if is_factory else ["env=3DBall"]
+    params = values_at(compose_config([*taker, *lines]).config.env.parameters, {})
+
+    options = {"seed": "--seed=N"} if is_factory else {"seed": "--seed=N", "num_areas": "--num-areas=N"}
+    for name, option in options.items():
+        if name in params:
+            raise ConfigError(f"env.params.{name} is given by an option of its own: use {option}")
+    return params
 
 
 def _describe(env: BaseEnv) -> list[str]:

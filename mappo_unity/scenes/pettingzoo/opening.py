@@ -11,8 +11,8 @@ from mlagents_envs.base_env import BaseEnv
 
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.option_table import with_article
-from mappo_unity.errors import ConfigError, EnvironmentFailure
-from mappo_unity.scenes.factory import check_call, explain_error, load_factory
+from mappo_unity.errors import ConfigError
+from mappo_unity.scenes.factory import check_call, explained, load_factory
 
 ALL, NONE = "all", "none"
 """Values of env.teams that are no function: one team, every agent alone."""
@@ -50,7 +50,8 @@ def open_copies(
     try:
         for number in range(count):
             copies.append(_make(factory, name, seed + number, params))
-        roles, specs = read_roles(copies[0], name, _team_function(teams, name))
+        with explained(f"{name}: what its agents and spaces are asked for"):
+            roles, specs = read_roles(copies[0], name, _team_function(teams, name))
     except BaseException:
         for copy in copies:
             copy.close()
@@ -64,12 +65,8 @@ def _make(factory: Callable[..., Any], name: str, seed: int, params: Mapping[str
 
     has_seed = _takes_seed(factory)
     check_call(factory, name, params, has_seed)
-    try:
+    with explained(name):
         env = factory(**params, **({"seed": seed} if has_seed else {}))
-    except (ConfigError, EnvironmentFailure):
-        raise
-    except (Exception, SystemExit) as error:
-        raise explain_error(error, name) from error
 
     if not isinstance(env, ParallelEnv):
         turns = "; for one whose agents take turns: pettingzoo.utils.aec_to_parallel"
@@ -96,9 +93,7 @@ def _team_function(teams: str, name: str) -> Callable[[str], Any] | None:
     function = load_factory(teams, f"env.teams={teams}")
 
     def team_of(agent: str) -> Any:
-        try:
+        with explained(f"{name}: the function of env.teams={teams}"):
             return function(agent)
-        except (Exception, SystemExit) as error:
-            raise explain_error(error, f"{name}: the function of env.teams={teams}") from error
 
     return team_of

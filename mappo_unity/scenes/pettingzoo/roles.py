@@ -48,29 +48,30 @@ def read_roles(
         raise ConfigError(f"{name}: its possible_agents is empty; it must name every agent that may appear")
 
     specs: dict[str, BehaviorSpec] = {}
+    spaces: dict[str, tuple[Any, Any]] = {}  # of a behavior's agents
     roles, teams = {}, {None: 0}
     for number, agent in enumerate(agents):
         where = f"{name}, agent {agent!r}"
-        sensors = read_sensors(env.observation_space(agent), where)
-        actions = Actions(env.action_space(agent), where)
-        spec = BehaviorSpec([sensor.spec for sensor in sensors], actions.spec)
+        seen, done = env.observation_space(agent), env.action_space(agent)
+        sensors, actions = read_sensors(seen, where), Actions(done, where)
 
-        behavior = _behavior(str(agent), spec, specs)
-        specs[behavior] = spec
+        behavior = _behavior(str(agent), (seen, done), spaces)
+        spaces[behavior] = seen, done
+        specs[behavior] = BehaviorSpec([sensor.spec for sensor in sensors], actions.spec)
         team = teams.setdefault(_team(team_of, str(agent), where), len(teams))
         roles[agent] = Role(number, behavior, team, sensors, actions)
 
     return roles, specs
 
 
-def _behavior(agent: str, spec: BehaviorSpec, specs: dict[str, BehaviorSpec]) -> str:
-    """Return the behavior of an agent: one that is known, or a new name."""
+def _behavior(agent: str, own: tuple[Any, Any], spaces: dict[str, tuple[Any, Any]]) -> str:
+    """Return the behavior of an agent with these spaces: one that is known, or a new name."""
     base = re.sub(r"[^\w.-]+", "_", re.sub(r"[_\-. ]?\d+$", "", agent)) or "agent"
 
     # agents of one name and several kinds: agent, agent_b, agent_c ...; a number at the end would be cut off
     for letter in range(26):
         name = f"{base}_{chr(ord('a') + letter)}" if letter else base
-        if specs.get(name, spec) == spec:
+        if spaces.get(name, own) == own:
             return name
     raise ConfigError(f"agents called {base} have more than 26 different spaces; give them different names")
 

@@ -110,13 +110,19 @@ def _encode_numbers(value: Any) -> np.ndarray:
 
 
 def _encode_bytes(value: Any) -> np.ndarray:
-    return from_bytes(np.asarray(value, np.uint8))
+    given = np.asarray(value)
+    levels = given.astype(np.uint8)
+    if given.dtype != np.uint8 and not np.array_equal(levels, given):
+        raise ValueError("it holds numbers other than 0, 1, ..., 255")
+    return from_bytes(levels)
 
 
 def _one_hot(numbers: Any, sizes: list[int]) -> np.ndarray:
     hot = np.zeros(sum(sizes), np.float32)
     start = 0
     for number, size in zip(numbers, sizes, strict=True):
+        if not 0 <= number < size:
+            raise ValueError(f"one of its numbers is none of the {size} that there are")
         hot[start + int(number)] = 1
         start += size
     return hot
