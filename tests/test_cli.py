@@ -26,8 +26,9 @@ from mappo_unity.config.presets import all_groups, describe_choices
 from mappo_unity.config.schema import Config, EvalConfig
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs import lock as run_lock
-from mappo_unity.runs.folder import create_folder, find_run, read_versions
+from mappo_unity.runs.folder import create_folder, find_run
 from mappo_unity.runs.lock import locked
+from mappo_unity.runs.versions import read_versions
 
 
 class FakeTraining:

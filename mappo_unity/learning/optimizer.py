@@ -28,6 +28,14 @@ def make_optimizer(actor: nn.Module, critic: nn.Module, cfg: PPOConfig) -> torch
     return kind_of(cfg)(groups, lr=cfg.lr, weight_decay=cfg.weight_decay, eps=cfg.optimizer_eps, fused=True)
 
 
+def load_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Restore an optimizer's moments; rates and all else that options say stay as they are now."""
+    options = [{name: v for name, v in group.items() if name != "params"} for group in optimizer.param_groups]
+    optimizer.load_state_dict(state)
+    for group, own in zip(optimizer.param_groups, options, strict=True):
+        group.update(own)
+
+
 def kind_of(cfg: PPOConfig) -> type[torch.optim.Adam]:
     """Return the class that ppo.optimizer names."""
     return torch.optim.AdamW if cfg.optimizer is Optimizer.adamw else torch.optim.Adam

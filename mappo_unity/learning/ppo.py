@@ -43,6 +43,7 @@ from mappo_unity.learning.optimizer import (
     clip_gradients,
     cloned,
     in_two_groups,
+    load_optimizer,
     make_optimizer,
 )
 from mappo_unity.learning.proximal import enter_proximal, needs_proximal, stale_kl, truncated_ratio
@@ -261,7 +262,8 @@ class PolicyLearner:
     def _load_trainable(self, state: dict[str, Any]) -> None:
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
-        self.optimizer.load_state_dict(in_two_groups(state["optimizer"], len(list(self.actor.parameters()))))
+        actor_size = len(list(self.actor.parameters()))
+        load_optimizer(self.optimizer, in_two_groups(state["optimizer"], actor_size))
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that resuming needs."""
@@ -291,4 +293,5 @@ class PolicyLearner:
         self.reader.load_state_dict(state.get("critic_states", {}))
         self.rollbacks, self.warmup.decisions = int(state["rollbacks"]), int(state.get("decisions", 0))
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2
-        self.rates.scale = float(state.get("lr_scale", 1.0))  # since 0.3
+        if self.cfg.lr_target_kl is not None:  # else the options have it that nothing steers
+            self.rates.scale = float(state.get("lr_scale", 1.0))  # since 0.3

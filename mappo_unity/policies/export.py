@@ -112,12 +112,13 @@ class RunExports:
     Args:
         folder: of the run.
         message: takes a line for the user.
+        is_resumed: the run was broken off, perhaps before its last export.
     """
 
-    def __init__(self, folder: Path, message: Callable[[str], None]) -> None:
+    def __init__(self, folder: Path, message: Callable[[str], None], is_resumed: bool = False) -> None:
         self.folder = folder / checkpoint.FOLDER
         self.message = message
-        self._stale = False
+        self._stale = is_resumed
         self._next_at = -math.inf
         self._warned: set[str] = set()
 

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from mappo_unity.runs.checkpoint_file import (
     checkpoints_in,
     newest_good,
     read_plain,
+    step_of,
     unreadable,
 )
 
@@ -41,6 +44,7 @@ __all__ = [
     "newest_good",
     "save",
     "save_in",
+    "set_aside_later",
 ]
 
 
@@ -89,6 +93,37 @@ def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, be
         old.unlink(missing_ok=True)
 
     return path
+
+
+def set_aside_later(folder: Path, resumed: Path, agent_steps: int) -> list[str]:
+    """Move checkpoints later than the one that a run goes on from out of its way, to ``abandoned_N/``.
+
+    They belong to a way that is not taken: among them new ones would count as old.
+
+    Args:
+        folder: the run's.
+        resumed: the checkpoint that the run goes on from.
+        agent_steps: its.
+
+    Returns:
+        A line for the user, where there are any.
+    """
+    later = [path for path in checkpoints_in(folder) if step_of(path) > agent_steps]
+    if not later:
+        return []
+
+    # The best one may be known by that name alone; a run resumes from numbered ones.
+    own = folder / FOLDER / NAME.format(agent_steps)
+    if not own.exists():
+        shutil.copy2(resumed, own)
+
+    numbers = count(1)
+    while (aside := folder / FOLDER / f"abandoned_{next(numbers)}").exists():
+        pass
+    aside.mkdir()
+    for path in later:
+        os.replace(path, aside / path.name)
+    return [f"{len(later)} later checkpoints, up to {step_of(later[-1]):,} steps, were moved to {aside}"]
 
 
 def load(path: Path) -> dict[str, Any]:

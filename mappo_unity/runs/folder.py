@@ -6,12 +6,9 @@ The record: config.yaml (every option), overrides.yaml (the command lines with t
 from __future__ import annotations
 
 import errno
-import importlib.metadata
 import json
 import os
-import platform
 import shutil
-import subprocess
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -27,14 +24,14 @@ from mappo_unity.config.user_modules import folder_of
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.json_record import read_json
-from mappo_unity.runs.lock import LOCK
+from mappo_unity.runs.lock import LOCK, locked
+from mappo_unity.runs.versions import read_versions
 
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
 RECORD = (CONFIG, OVERRIDES, VERSIONS)
 FACTORY_FOLDER = "factory_folder"  # in versions.json
 PLAYERS = "players"  # the folder of their logs
-_NO_WORK = (*RECORD, LOCK)  # files of a run that trained nothing
-_PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "numpy", "mlagents-envs", "protobuf", "hydra-core")
+METRICS, EVENTS = "metrics.csv", "tensorboard"  # logs, the latter a folder
 
 
 @dataclass(frozen=True)
@@ -75,9 +72,9 @@ def create_folder(wanted: Path, exact: bool = False) -> NewFolder:
 
 
 def discard_folder(folder: NewFolder, reason: BaseException | None = None) -> None:
-    """Remove the folder of a run that never began, unless it holds more than the record.
+    """Remove the folder of a run that completed no iteration, unless it holds more than the record.
 
-    Players' logs are no more, unless `reason`, which the user is told, names one.
+    Logs without a row are no more, nor are players' logs, unless `reason`, which the user is told, names one.
     """
     named = (folder.path / PLAYERS).is_dir() and str(folder.path / PLAYERS) in str(reason)
     if named or _other_files(folder.path):
@@ -213,29 +210,10 @@ def factory_folder(folder: Path) -> Path | None:
     return Path(found) if isinstance(found, str) and found else None
 
 
-def read_versions() -> dict[str, Any]:
-    """Return the versions of Python, of this package and its commit, and of what it stands on."""
-    versions: dict[str, Any] = {"python": platform.python_version(), "platform": platform.platform()}
-
-    for package in ("mappo-unity", *_PACKAGES):
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = None
-
-    # A checkout that is used without being installed.
-    if versions["mappo-unity"] is None:
-        from mappo_unity import __version__
-
-        versions["mappo-unity"] = __version__
-
-    return {**versions, **_git_state(Path(__file__).resolve().parents[2])}
-
-
 def _claim(wanted: Path, exact: bool) -> Path:
     if exact:
         wanted.mkdir(exist_ok=True)
-        if any(wanted.iterdir()):
+        if any(wanted.iterdir()) and not _clear_unbegun(wanted):
             raise ConfigError(
                 f"the folder {wanted} is not empty, and nothing is overwritten: "
                 f"name another one, or resume the run in it with {shell_argument('resume', wanted)}"
@@ -266,25 +244,41 @@ def _history(path: Path) -> list[Any]:
     return history if isinstance(history, list) else []
 
 
+def _clear_unbegun(folder: Path) -> bool:
+    """Empty a folder if it is that of a run killed before its first iteration was complete; tell whether."""
+    is_run = all((folder / name).is_file() for name in RECORD)
+    if not is_run or _other_files(folder):
+        return False
+
+    # Another process may be about to complete it.
+    with locked(folder) as warning:
+        if warning is not None:
+            return False
+        for path in folder.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path)
+            elif path.name != LOCK:
+                path.unlink()
+    return True
+
+
 def _other_files(folder: Path) -> dict[Path, tuple[int, int]]:
-    found = (path for path in folder.rglob("*") if path.is_file() and path.name not in _NO_WORK)
-    return _state_of(path for path in found if path.relative_to(folder).parts[0] != PLAYERS)
+    """Return what a run's folder holds beside its record and the logs of a run without an iteration."""
+    has_rows = bool(_line_after_first(folder / METRICS))
+    no_work = (*RECORD, LOCK) if has_rows else (*RECORD, LOCK, METRICS)
+    no_folders = (PLAYERS,) if has_rows else (PLAYERS, EVENTS)
+
+    found = (path for path in folder.rglob("*") if path.is_file() and path.name not in no_work)
+    return _state_of(path for path in found if path.relative_to(folder).parts[0] not in no_folders)
+
+
+def _line_after_first(path: Path) -> str:
+    if not path.is_file():
+        return ""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        file.readline()
+        return file.readline()
 
 
 def _state_of(files: Iterable[Path]) -> dict[Path, tuple[int, int]]:
     return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in files}
-
-
-def _git_state(checkout: Path) -> dict[str, Any]:
-    if not (checkout / ".git").exists():
-        return {}
-    try:
-        commit = _git(checkout, "rev-parse", "HEAD").strip()
-        return {"git_commit": commit, "git_dirty": bool(_git(checkout, "status", "--porcelain").strip())}
-    except (OSError, subprocess.SubprocessError):
-        return {}
-
-
-def _git(checkout: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(checkout), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout

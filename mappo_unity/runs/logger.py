@@ -25,6 +25,7 @@ from mappo_unity.config.overrides import shell_argument
 from mappo_unity.config.schema import LogConfig, LoggerKind, TagKind
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.behavior_events import BehaviorEvents
+from mappo_unity.runs.folder import METRICS
 from mappo_unity.runs.metrics_csv import STEP, MetricsFile, keep_until, read_metrics
 from mappo_unity.runs.progress import Progress, current_job
 
@@ -69,7 +70,7 @@ class RunLog:
         console: Console | None = None,
     ) -> None:
         check_loggers(cfg)
-        metrics = folder / "metrics.csv"
+        metrics = folder / METRICS
         self._console = console or Console()
 
         if resume_steps is not None:

@@ -150,7 +150,7 @@ class RunState:
     def begin(self) -> None:
         """Do what a run begins with when nothing can be refused any more."""
         if self.self_play is not None:
-            self.self_play.begin(self._about())
+            self.self_play.begin(self.agent_steps, self._about())
 
     def advance_self_play(self, batch: Batch, batches: Batches) -> dict[str, float]:
         """Count what opponents did in a batch, and choose those of the next ones; return metrics."""
@@ -186,10 +186,7 @@ class RunState:
         return rivals
 
     def score(self) -> float:
-        """Return what a best checkpoint is chosen by that no matches choose: return_mean.
-
-        Of demonstrations played back it says nothing; there the newest checkpoint has learnt most.
-        """
+        """Return what a best checkpoint is chosen by: return_mean; where all is cloned, which is newest."""
         return float(self.agent_steps) if self.cfg.bc.only else self.recent_episodes.score()
 
     def is_best(self) -> bool:
@@ -237,16 +234,18 @@ class RunState:
 
         for name, learner in self.setup.learners.items():
             learner.load_state_dict(state["learners"][name])
+        if is_new := not has_snapshot(state):  # new episodes begin: what is pending has no outcome
+            self.setup.forget_pending()
         check_workers(path, state, self.cfg.collect.workers)
         self.setup.generators = known_generators(state, self.cfg.learners)
         self._restore_fleet(path, state)
-        self._restore_lessons(state.get("lessons", {}), is_new=not has_snapshot(state))
+        self._restore_lessons(state.get("lessons", {}), is_new)
 
         self.recent_episodes.load_state_dict(state["window"])
         self.matches.load_state_dict(state["matches"], state["best_score"])
         # a run may take up self-play, or leave it, when it is resumed
-        if self.self_play is not None and state.get("self_play") is not None:
-            self.self_play.load_state_dict(state["self_play"], self.notes.append)
+        if self.self_play is not None and (known := state.get("self_play")) is not None:
+            self.self_play.load_state_dict(known, state["agent_steps"], is_new, self.notes.append)
         for name in _COUNTERS:
             setattr(self, name, state[name])
 

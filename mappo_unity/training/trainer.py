@@ -20,6 +20,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
 from mappo_unity.policies.warm_start.start import warm_start
 from mappo_unity.reports.dashboard import dashboard
+from mappo_unity.runs.checkpoint import set_aside_later
 from mappo_unity.runs.logger import RunLog
 from mappo_unity.scenes.contract.statistics import Statistics
 from mappo_unity.signals import Interrupted
@@ -71,12 +72,16 @@ def train(
         resume_steps = state.agent_steps if resume_from is not None else None
         with RunLog(cfg.log, folder, cfg.max_steps, resume_steps, console) as log:
             # not before: until here something may be refused
-            begun = f"run folder: {folder}" if resume_from is None else f"resuming from {resume_from}"
+            begun = [f"run folder: {folder}"]
+            if resume_from is not None:
+                aside = set_aside_later(folder, resume_from, state.agent_steps)
+                begun = [f"resuming from {resume_from}", *aside]
             served = [] if address is None else [f"dashboard: {address}"]
-            for note in [begun, *served, *setup.notes, *state.notes, *started]:
+            for note in [*begun, *served, *setup.notes, *state.notes, *started]:
                 log.message(note)
 
-            exports = RunExports(folder, log.message) if cfg.export_onnx else None
+            is_resumed = resume_from is not None
+            exports = RunExports(folder, log.message, is_resumed) if cfg.export_onnx else None
             saver = CheckpointSaver(cfg, folder, state, exports, resume_from)
             stop = StopSignals(log.message)
             specs = {name: behavior.spec for name, behavior in setup.env.behaviors.items()}

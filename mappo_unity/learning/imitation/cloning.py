@@ -18,7 +18,7 @@ from mappo_unity.learning.advantage import share_left
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import ActionDistribution
-from mappo_unity.learning.optimizer import kind_of
+from mappo_unity.learning.optimizer import kind_of, load_optimizer
 
 
 class Cloning:
@@ -125,7 +125,7 @@ class Cloning:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        self.optimizer.load_state_dict(state)
+        load_optimizer(self.optimizer, state)
 
 
 def _cut(first: Tensor, length: int) -> Tensor:

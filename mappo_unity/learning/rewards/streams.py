@@ -21,6 +21,7 @@ from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout, RunningNorm, running_norms
 from mappo_unity.learning.networks.images import OURS
+from mappo_unity.learning.optimizer import load_optimizer
 from mappo_unity.learning.rewards.curiosity import Curiosity
 from mappo_unity.learning.rewards.gail import Discriminator
 from mappo_unity.learning.rewards.rnd import RandomNetwork
@@ -114,7 +115,7 @@ class IntrinsicStream:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.model.load_state_dict(state["model"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        load_optimizer(self.optimizer, state["optimizer"])
         self.returns.load_state_dict(state["returns"])
 
 

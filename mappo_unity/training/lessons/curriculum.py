@@ -18,7 +18,7 @@ from mappo_unity import keys
 from mappo_unity.config.parameters.curriculum import GROUP_REWARD, PROGRESS, REWARD, Completion, Lesson
 from mappo_unity.config.parameters.samplers import Sampler, Value
 from mappo_unity.config.parameters.values import curricula, show_parameter, values_at
-from mappo_unity.config.schema import EnvConfig
+from mappo_unity.config.schema import Backend, EnvConfig
 from mappo_unity.envs.returns import Episode
 from mappo_unity.errors import ConfigError
 from mappo_unity.training.collection.description import Played
@@ -50,6 +50,7 @@ class Lessons:
     Args:
         parameters: of the environment, as `EnvConfig.parameters` returns them.
         team_sizes: of every policy name, agents of its largest team.
+        sets_numbers: plain numbers are parameters that can be set, not what an environment was made with.
 
     Attributes: `numbers`, lesson of each parameter with a curriculum, from 0; `notes`, lines for the user.
 
@@ -57,8 +58,11 @@ class Lessons:
         ConfigError: a lesson waits for a behavior that there is not.
     """
 
-    def __init__(self, parameters: Mapping[str, Any], team_sizes: Mapping[str, int]) -> None:
+    def __init__(
+        self, parameters: Mapping[str, Any], team_sizes: Mapping[str, int], sets_numbers: bool = False
+    ) -> None:
         self._parameters, self._curricula = parameters, curricula(parameters)
+        self._sets_numbers = sets_numbers
         self._check_behaviors(list(team_sizes))
 
         self.numbers = dict.fromkeys(self._curricula, 0)
@@ -126,8 +130,8 @@ class Lessons:
         """Restore what `state_dict` returned, or nothing (older checkpoints).
 
         Returns:
-            Samplers and lessons whose value differs from that in force when the state was taken, as options
-            were changed since.
+            What can be set and differs from what was in force when the state was taken, as options were
+            changed since; of older states, which hold no plain numbers, all of these.
         """
         for name, number in state.get("numbers", {}).items():
             if name in self.numbers:
@@ -143,10 +147,14 @@ class Lessons:
         return {name: self.values[name] for name in changed}
 
     def _shown(self) -> dict[str, str]:
-        """Return the values in force of parameters that are no plain numbers, for reading."""
-        values = self.values
-        moving = [n for n in values if n in self._curricula or isinstance(values[n], Sampler)]
-        return {name: show_parameter(values[name]) for name in moving}
+        """Return the values in force of parameters that can be set, for reading."""
+        shown = {}
+        for name, value in self.values.items():
+            if name in self._curricula or isinstance(value, Sampler):
+                shown[name] = show_parameter(value)
+            elif self._sets_numbers:
+                shown[name] = str(value)
+        return shown
 
     def _is_complete(self, name: str, progress: float, with_news: set[str]) -> bool:
         completion = self._curricula[name].lessons[self.numbers[name]].completion
@@ -230,7 +238,8 @@ def _listed(windows: Mapping[str, deque[float]]) -> dict[str, list[float]]:
 def lessons_of(cfg: EnvConfig, env: Played) -> Lessons:
     """Return the lessons of the options; raise ConfigError where the environment does not fit them."""
     sizes = {name: env.behaviors[sides[0]].slots.team_size for name, sides in env.sides.items()}
-    lessons = Lessons(cfg.parameters, sizes)
+    is_made = cfg.backend in (Backend.custom, Backend.pettingzoo)  # with the parameters as arguments
+    lessons = Lessons(cfg.parameters, sizes, sets_numbers=not is_made)
     if lessons.numbers and not env.takes_parameters:
         raise ConfigError(
             f"env.params.{next(iter(lessons.numbers))} has lessons, but the environment's parameters cannot "

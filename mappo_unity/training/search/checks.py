@@ -11,7 +11,7 @@ from typing import Any
 
 from mappo_unity.config.compose import check_effect, compose_config
 from mappo_unity.config.extras import install_command
-from mappo_unity.config.option_table import did_you_mean, find_option, option_table, show_value
+from mappo_unity.config.option_table import did_you_mean, find_option, option_table
 from mappo_unity.config.overrides import given_options
 from mappo_unity.config.presets import group_choices
 from mappo_unity.config.schema import Config, SearchConfig, SearchObjective
@@ -19,7 +19,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.policies.first_checks import check_environment
 from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.runs.json_record import record_to_resume
-from mappo_unity.training.search.space import Range, Space, read_space, to_line
+from mappo_unity.training.search.space import Choices, Range, Space, read_space, to_line
 
 RECORD = "search.json"
 """What a search is, in its folder: a later call with the same goes on with it."""
@@ -110,11 +110,8 @@ def check_search(options: SearchConfig, lines: list[str], file: Path | None) -> 
         lines = [*lines, f"stop_at_return={options.goal:g}"]
 
     config = _check_corners(space, lines, file)
-    preset = {key: _value(config, key) for key in space}
-    preset = {
-        key: value if isinstance(space[key], Range) else show_value(value) for key, value in preset.items()
-    }
-    is_inside = all(space[key].holds(value) for key, value in preset.items())
+    preset = {key: _as_written(entry, _value(config, key)) for key, entry in space.items()}
+    is_inside = all(entry.holds(preset[key]) for key, entry in space.items())
 
     plan = SearchPlan(
         options,
@@ -159,6 +156,10 @@ def _check_corners(space: Space, lines: list[str], file: Path | None) -> Config:
 
     check_environment(adopt_file_options(config, [*lines, *corner], file))
     return plain
+
+
+def _as_written(entry: Range | Choices, value: Any) -> Any:
+    return entry.written(value) if isinstance(entry, Choices) else value
 
 
 def _value(config: Config, key: str) -> Any:

@@ -56,6 +56,13 @@ class Choices:
 
     values: tuple[str, ...]
 
+    def written(self, value: Any) -> str:
+        """Return a value as the list writes it, where it has it: 1 and 1.0 are one number."""
+        text = show_value(value)
+        if text not in self.values and isinstance(value, float):
+            return next((own for own in self.values if _number(own) == value), text)
+        return text
+
     def holds(self, value: Any) -> bool:
         """Return whether a value, as it is written, is one of them."""
         return value in self.values
@@ -63,6 +70,13 @@ class Choices:
     def ends(self) -> tuple[Any, Any]:
         """Return the first and the last value."""
         return self.values[0], self.values[-1]
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 Space = dict[str, "Range | Choices"]

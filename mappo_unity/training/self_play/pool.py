@@ -16,7 +16,7 @@ import torch
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs import checkpoint
-from mappo_unity.runs.checkpoint_file import POOL, CheckpointError, step_of
+from mappo_unity.runs.checkpoint_file import POOL, CheckpointError, read_plain, step_of
 
 _FORGET = 200.0  # results after which older ones count half, so that a share won is of recent matches
 
@@ -68,6 +68,7 @@ class Pool:
         self._folder, self._window = folder, window
         self._snapshots: list[Snapshot] = []
         self._next = 0
+        self._best: tuple[int, int] | None = None  # the best checkpoint's time, ns, and agent decisions
 
     @property
     def numbers(self) -> list[int]:
@@ -124,12 +125,28 @@ class Pool:
             used: numbers that are still playing.
         """
         kept = [step_of(path) for path in checkpoint.checkpoints_in(self._folder)]
+        if not kept:
+            return
+        best = self._best_steps()
         for snapshot in list(self._snapshots):
             dropped_at = snapshot.dropped_at
-            if dropped_at is None or snapshot.number in used or not kept or kept[0] < dropped_at:
+            if dropped_at is None or snapshot.number in used or kept[0] < dropped_at:
+                continue
+            if best is not None and snapshot.steps <= best < dropped_at:
                 continue
             (self._folder / POOL / snapshot.file).unlink(missing_ok=True)
             self._snapshots.remove(snapshot)
+
+    def _best_steps(self) -> int | None:
+        """Return the agent decisions of the best checkpoint, which is kept, too."""
+        path = self._folder / checkpoint.FOLDER / checkpoint.BEST
+        try:
+            changed = path.stat().st_mtime_ns
+            if self._best is None or self._best[0] != changed:
+                self._best = changed, int(read_plain(path)["agent_steps"])
+        except (OSError, CheckpointError):
+            return None
+        return self._best[1]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the snapshots by reference to their files."""

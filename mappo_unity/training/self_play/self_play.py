@@ -74,14 +74,16 @@ class SelfPlay:
         self._draws = 0
         self._learning = None if self._cfg.team_change is None else min(self._sides)
 
-    def begin(self, about: Mapping[str, Any]) -> None:
-        """Take the first snapshot and draw opponents, where a run begins.
+    def begin(self, agent_steps: int, about: Mapping[str, Any]) -> None:
+        """Take the first snapshot and draw opponents, where self-play begins; count all intervals from there.
 
         Args:
+            agent_steps: agent decisions of the run; more than 0 where one is resumed that had no opponents.
             about: what a snapshot's file needs beside networks to be played.
         """
         if self._draws == 0:
-            self._save(0, about)
+            self._drawn_at = self._changed_at = agent_steps
+            self._save(agent_steps, about)
             self._draw()
 
     def advance(
@@ -242,10 +244,14 @@ class SelfPlay:
             "at": [self._saved_at, self._drawn_at, self._changed_at],
         }
 
-    def load_state_dict(self, state: Mapping[str, Any], say: Callable[[str], None]) -> None:
+    def load_state_dict(
+        self, state: Mapping[str, Any], agent_steps: int, is_new: bool, say: Callable[[str], None]
+    ) -> None:
         """Restore what `state_dict` returned.
 
         Args:
+            agent_steps: agent decisions of the run then.
+            is_new: the environment begins new episodes, perhaps with other teams: who plays is drawn anew.
             say: takes a line about each opponent that is left out.
 
         Raises:
@@ -256,20 +262,26 @@ class SelfPlay:
                 f"self_play.fixed={list(self._cfg.fixed)} cannot change with resume: the run has "
                 f"{list(state['fixed'])}"
             )
-        self._opponents.load_state_dict(state["opponents"], self._device)
+        if not is_new:
+            self._opponents.load_state_dict(state["opponents"], self._device)
         self._pool.load_state_dict(state["pool"], self._used(), self._cfg.skip_missing, say)
         self._draws = int(state["draws"])
         self._saved_at, self._drawn_at, self._changed_at = (int(at) for at in state["at"])
         self.elo |= {name: float(elo) for name, elo in state["elo"].items() if name in self.elo}
         if self._learning is not None and state["learning"] is not None:
             self._learning = int(state["learning"])
+        elif self._learning is not None:  # sides take turns from now on
+            self._changed_at = agent_steps
 
         there = {*self._pool.numbers, *self._fixed}
         for name in self._names:
             rows = state["records"].get(name, [])
             self._records[name] = {int(n): Record(*values) for n, *values in rows if n in there}
             self._opponents.replace(name, self._pool.all_numbers | {*self._fixed, LATEST})
-        self._line_up()
+        if is_new:
+            self._draw()
+        else:
+            self._line_up()
 
 
 def _two_sides(cfg: Config, setup: TrainingSetup) -> dict[int, list[str]]:
