@@ -15,7 +15,7 @@ from mappo_unity.config.schema import CollectConfig, Config, EnvConfig, LogConfi
 from mappo_unity.policies.evaluate import evaluate
 from mappo_unity.runs.folder import write_record
 from mappo_unity.sharing import facts
-from mappo_unity.sharing.card import Earned, Facts, Won, card_text, is_ours, merged, split
+from mappo_unity.sharing.card import Earned, Facts, LastWindow, Won, card_text, is_ours, merged, split
 from mappo_unity.sharing.train_line import train_line
 from mappo_unity.training.trainer import train
 
@@ -159,6 +159,15 @@ def test_matches_have_their_share_and_interval():
 
     drawn = card_text(replace(KNOWN, score=Won(math.nan, math.nan, math.nan, 0, 7, 0)))
     assert "7 drawn" in drawn and "nan" not in drawn and "model-index" not in drawn
+
+
+def test_one_episode_has_no_error_and_undecided_matches_no_share():
+    one = card_text(replace(KNOWN, score=Earned(7.0, math.nan, 1)))
+    assert "Return 7 in one episode" in one and "nan" not in one
+
+    last = card_text(replace(KNOWN, score=LastWindow(0.0, 1.0, 0.984)))
+    assert "it won 100.0 % of the decided ones, 98.4 % of all drawn" in last
+    assert "it decided none" in card_text(replace(KNOWN, score=LastWindow(0.0, math.nan, 1.0)))
 
 
 def test_names_break_no_table():

@@ -200,6 +200,7 @@ def test_a_place_that_cannot_be_written_is_told(
     training: FakeTraining, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("taken").write_text("a file")
+    assert train_main(["output_dir="]) == 2 and "output_dir= is empty" in capsys.readouterr().err
     assert train_main(["output_dir=taken"]) == 2
     message = capsys.readouterr().err
     assert "taken" in message and "output_dir=" in message

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 import sys
@@ -123,6 +124,20 @@ def test_behaviors_may_have_any_name() -> None:
     }
     model, ppo, *_ = behavior_config(config, "3DBall")
     assert (model.hidden, ppo.lr, ppo.gamma) == ([8, 4], 2e-4, 0.9)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "behaviors.3DBall.ppo.time_horizon=99999999999999999999",
+        "behaviors.3DBall.model.hidden=[99999999999999999999]",
+        "behaviors.3DBall.model.normalize_obs=1",
+    ],
+)
+def test_options_of_a_behavior_are_checked_as_those_of_all(line: str) -> None:
+    option = line.partition("=")[0]
+    with pytest.raises(ConfigError, match=re.escape(option)):
+        behavior_config(compose_config(["env=3DBall", line]).config, "3DBall")
 
 
 def test_run_folder_is_named_by_env_and_by_the_user() -> None:

@@ -225,6 +225,23 @@ def test_rare_rewards_and_equal_ones() -> None:
     assert found(rare) == []
     same = {"episodes": FACTS["episodes"] | {"greatest": 0.0}}
     assert found(same, return_mean=0.0) == ["equal returns", "no rise"]
+    assert found(same) == [], "it had risen before the survey began"
+    assert found(same, {"init_from": "zoo"}, return_mean=100.0) == [], "it knew all from the start"
+
+    never = {"rewards": FACTS["rewards"] | {"nonzero": 0}}
+    assert found(never | {"decisions": 20_000}) == ["no reward"]
+    assert found(never | {"decisions": 19_999}) == [], "a resumed run: too early to say"
+
+
+def test_a_frozen_behavior_has_no_findings_of_learning() -> None:
+    still = {"Ball/kl": 1e-9, "Ball/clip_fraction": 0.0, "kl": 1e-9, "clip_fraction": 0.0}
+    run = run_of(return_mean=0.0, **still, **{"Goal/frozen": 1.0})
+    (said,) = [
+        finding.text
+        for finding in diagnose(Evidence(run, {"Ball": FACTS, "Goal": FACTS}))
+        if finding.kind == "no steps"
+    ]
+    assert said == "Ball: updates change nothing"
 
 
 def test_what_the_environment_sends() -> None:

@@ -106,6 +106,19 @@ def test_evaluation_plays_another_episode_for_one_that_was_cut_off() -> None:
     assert [(e.agent_id, e.individual_return, e.length) for e in episodes] == [(0, 3, 1), (1, 5, 2)]
 
 
+def test_evaluation_begins_another_one_though_some_episodes_did_not_count() -> None:
+    env = Fragile(
+        [
+            [Record(0), Record(1)],
+            [Record(0, ends="interrupted"), Record(1, ends="interrupted"), Record(0), Record(1)],
+            [Record(0, ends="terminated", reward=3), Record(0), Record(1)],
+        ]
+    )
+    env.breaks_at, env.cut = 1, (0, 1)
+    (episode,) = play(env, RandomPolicy(0), 1)[FAKE]  # agent 1's was the second one begun
+    assert (episode.agent_id, episode.individual_return) == (0, 3)
+
+
 def test_a_behavior_that_a_player_shows_late_is_refused() -> None:
     env = fragile([[Record(0)]] * 5, 99, ())
     env.base_env.specs["Late?team=0"] = behavior_spec()

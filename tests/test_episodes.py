@@ -19,7 +19,8 @@ from mappo_unity.training.setup import set_up
 def test_episodes_of_agents_alone_have_the_textbook_s_standard_error():
     figures = summarize([Episode(0, value, 0.0, 10, False) for value in (1.0, 2.0, 3.0, 6.0)])
     assert figures["mean_return"] == 3.0
-    assert figures["stderr"] == pytest.approx(np.sqrt(3.5) / 2)
+    assert figures["stderr"] == pytest.approx(np.sqrt(14 / 3) / 2)
+    assert math.isnan(summarize([Episode(0, 1.0, 0.0, 10, False)])["stderr"])
 
 
 def test_team_mates_are_not_counted_twice():

@@ -14,7 +14,7 @@ from mappo_unity.config.mlagents.flags import flag_of, parse_flags
 from mappo_unity.config.mlagents.keys import RUN
 from mappo_unity.config.mlagents.read import read_settings
 from mappo_unity.config.mlagents.translate import translate
-from mappo_unity.config.per_behavior import behavior_config
+from mappo_unity.config.per_behavior import behavior_config, init_source
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.behavior_events import mlagents_tags
 from mappo_unity.runs.metrics_csv import read_metrics
@@ -117,6 +117,39 @@ def test_numbers_may_be_texts_as_yaml_reads_them(tmp_path):
     text = of_behavior("    max_steps: 5e5\n    hyperparameters: {learning_rate: 1e-4}\n")
     config, _ = composed(tmp_path, text)
     assert (config.max_steps, config.ppo.lr) == (500_000, 1e-4)
+
+    text += """environment_parameters:
+  mass: {sampler_type: gaussian, sampler_parameters: {mean: 1e0, st_dev: 1e-3}}
+  level:
+    curriculum:
+      - name: 1e0
+        completion_criteria: {measure: progress, behavior: Ball, threshold: 1e-1, min_lesson_length: 1e2}
+        value: 1e1
+      - {name: last, value: 2}
+"""
+    config, _ = composed(tmp_path, text)
+    mass, level = (config.env.parameters[name] for name in ("mass", "level"))
+    assert mass.numbers == (1.0, 1e-3) and level.lessons[0].value == 10.0
+    completion = level.lessons[0].completion
+    assert (completion.threshold, completion.min_lesson_length) == (0.1, 100)
+
+
+def test_names_with_dots_are_names(tmp_path):
+    text = of_behavior("    max_steps: 5\n").replace("Ball", "My.Ball")
+    text += "environment_parameters: {ball.mass: 3, 'a=b': {sampler_type: uniform}, scale: 2}\n"
+    config, _ = composed(tmp_path, text)
+    assert {"ball.mass": 3, "scale": 2}.items() <= config.env.params.items()
+    assert config.env.parameters["a=b"].kind == "uniform"
+    assert list(config.behaviors) == ["My.Ball"]
+
+
+def test_a_behavior_may_begin_with_nothing(tmp_path):
+    text = "default_settings: {trainer_type: ppo, init_path: base.onnx}\n"
+    text += "behaviors: {A: {init_path: null}, B: {max_steps: 5}}\n"
+    config, _ = composed(tmp_path, text)
+    assert config.init_from == "base.onnx"
+    assert init_source(config, "A") == ("behaviors.A.init_from", None)
+    assert init_source(config, "B") == ("init_from", "base.onnx")
 
 
 def test_signals_replace_the_default_and_those_of_default_settings_stay(tmp_path):
@@ -383,6 +416,10 @@ def test_a_mistake_is_one_line_with_file_line_and_key(tmp_path, monkeypatch, cap
         (["--env=scene:3DBall", "ppo.epochs=0"], "mappo-learn: ppo.epochs=0 is out of range"),
         (["--run-id=a/b"], "--run-id=a/b must be the name of a folder"),
         (["--resume", "--run-id=none"], "no run to resume in results/none"),
+        (["--env=scene:3DBall", "hydra.run.dir=x"], "hydra.run.dir does not go with mappo-learn, whose flag"),
+        (["--env=scene:3DBall", "output_dir=x"], "output_dir does not go with mappo-learn"),
+        (["--run-id=none", "resume=x"], "resume does not go with mappo-learn, whose flag is --resume"),
+        (["--env-args=foo"], "--env-args is written --env-args WORD ..."),
     ],
 )
 def test_mistakes_of_the_command_line(tmp_path, monkeypatch, capsys, flags, said):
@@ -469,9 +506,9 @@ def test_a_run_is_not_overwritten_but_resumed_and_replaced(trained, tmp_path, mo
     assert "other.yaml, line 3: behaviors.Other: the environment has no behavior 'Other'" in error
     assert (run / "config.yaml").read_bytes() == config
 
-    # what a new run would begin with is no matter to one that goes on
+    # what a new run would begin with is no matter to one that goes on; nor is its environment named again
     Path("my.yaml").write_text(BALL + "    init_path: results/first/3DBall.onnx\n")
-    assert learn_main(["my.yaml", "--run-id=first", "--resume", *SMALL, "max_steps=720"]) == 0
+    assert learn_main(["my.yaml", "--run-id=first", "--resume", *SMALL[1:], "max_steps=720"]) == 0
     assert [row["agent_steps"] for row in read_metrics(run / "metrics.csv")] == [240, 480, 720]
     assert [step for step, _ in points(run / "3DBall")["Policy/Entropy"]] == [240, 480, 720]
     assert (run / "3DBall" / "3DBall-720.onnx").is_file()

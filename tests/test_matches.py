@@ -127,8 +127,18 @@ def test_a_team_counts_once_a_match():
         end(6, 3, -1.0),
         end(2, 1, -1.0),
     ]
-    score = count(rows, grouped=True)
+    score = count(rows, members=2)
     assert (score.wins, score.draws, score.losses, score.decisions) == (1, 0, 2, 15)
+
+
+def test_the_last_member_of_a_team_speaks_and_may_be_back_under_another_id():
+    def end(agent, length, result):
+        return Episode(agent, 0.0, result, length, False, 1)
+
+    # out before the team wins; the next match has two new members; the last one began too late to count
+    rows = [end(0, 3, 0.0), end(1, 9, 1.0), end(2, 4, 0.0), end(3, 8, -1.0), end(4, 2, 1.0)]
+    score = count(rows, members=2)
+    assert score.played == ((1, 9), (-1, 8), (1, 2))
 
 
 def test_scenes_with_one_side_are_refused():

@@ -130,6 +130,9 @@ def test_the_first_minibatch_has_ratio_one_and_its_old_values(
         for _ in range(3):
             buffer, _ = learner.prepare(*next(batches).of("Probe"))
             assert buffer is not None
+            carried = learner.carried.rounds
+            if carried is not None:  # who is not pending does not begin an episode there
+                assert not (carried[keys.FIRST] & ~carried["valued"]).any()
             minibatch = learner.rows.take(buffer[:])
             learner.loss(minibatch)
             assert learner.loss.log_ratio.abs().max() < 1e-5
@@ -139,6 +142,8 @@ def test_the_first_minibatch_has_ratio_one_and_its_old_values(
                 value, baseline = learner.loss._values(minibatch)
             mask = minibatch["critic_learns"]
             assert mask.any()
+            # each value that is known is learnt once, also those of members that have departed
+            assert int(mask.sum()) == int(learner.rows._rounds["critic_learns"].sum())
             assert (value - minibatch[keys.VALUE])[mask].abs().max() < 1e-4
             if baseline is not None:
                 assert (baseline - minibatch["baseline"])[minibatch["actor_learns"]].abs().max() < 1e-4

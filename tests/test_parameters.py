@@ -199,6 +199,10 @@ def test_values_are_shown() -> None:
             ["env.params.mass={sampler: gaussian}", "env.params.mass={sampler: uniform}"],
             {"sampler": "uniform"},
         ),
+        (["env.params.mass={sampler: gaussian}", "env.params.mass=3"], 3),
+        (["env.params={mass: {sampler: gaussian}}", "env.params={mass: 3}"], 3),
+        (["env.params.mass={sampler: gaussian}", "~env.params.mass", "+env.params.mass=3"], 3),
+        (["env.params.mass=3", "env.params.mass={lessons: [{value: 2}]}"], lessons({"value": 2})),
     ],
 )
 def test_the_command_line_takes_them(lines: list[str], mass: Any) -> None:

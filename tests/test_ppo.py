@@ -12,14 +12,16 @@ from mappo_unity.config.schema import (
     Activation,
     CriticKind,
     ModelConfig,
+    ObsNormUpdate,
     PPOConfig,
     RatioKind,
     Schedule,
     ValueLoss,
     ValueNormKind,
+    ValueNormUpdate,
 )
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.loss import ACTOR_LEARNS
+from mappo_unity.learning.loss import ACTOR_LEARNS, move_with_minibatch
 from mappo_unity.learning.networks.actor_critic import make_actor, make_critic
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
@@ -310,6 +312,39 @@ def test_value_clipping_follows_the_schedule():
     # the critic is right, and has moved by 1 since: only 0.3 of that count
     expected = torch.nn.functional.huber_loss(value - 0.7, value, delta=10.0)
     assert learner.loss(rows)["loss_critic"].item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", list(ValueNormKind))
+@pytest.mark.parametrize("update", list(ValueNormUpdate))
+def test_values_are_clipped_around_what_the_critic_said(kind, update):
+    if kind is ValueNormKind.popart and update is ValueNormUpdate.minibatch:
+        pytest.skip("they do not go together")
+    learner = make_learner(clip_value=True, normalize_values=kind, value_norm_update=update, lr=1e-9)
+    for _ in range(3):  # the statistics move
+        batch = make_batch(learner)
+        batch["next", "reward"] += 3.0
+        rows = prepared(learner, batch)
+        if update is ValueNormUpdate.minibatch:
+            move_with_minibatch(learner.value_norm, rows)
+        with torch.no_grad():
+            said = learner.critic(rows.clone())["state_value"]
+        torch.testing.assert_close(rows["state_value"], said, atol=1e-5, rtol=1e-5)
+
+
+def test_a_normaliser_that_moves_with_each_round_stands_still_while_the_critic_warms_up():
+    options = {"critic_warmup_steps": 2 * T * G * A, "obs_norm_update": ObsNormUpdate.round}
+    learner = make_learner(model={"normalize_obs": True}, **options)
+    assert learner.actor.moving_norms == []
+    batch = make_batch(learner)
+    assert learner.learn(*whole(batch), 0.0)["critic_warmup"] == 1.0
+    assert learner.actor.moving_norms == []
+
+    resumed = make_learner(model={"normalize_obs": True}, **options)
+    resumed.load_state_dict(learner.state_dict())
+    for one in (learner, resumed):
+        assert one.actor.moving_norms == []
+        one.learn(*whole(batch), 0.0)
+        assert len(one.actor.moving_norms) == 1  # the critic has learnt its steps
 
 
 def test_a_ratio_of_each_component_is_clipped_by_itself():

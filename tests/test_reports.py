@@ -6,6 +6,7 @@ import base64
 import csv
 import hashlib
 import json
+import math
 import os
 import re
 import shutil
@@ -448,6 +449,13 @@ def test_parallel_coordinates_place_values(tmp_path: Path) -> None:
     # lr by its logarithm: the middle one half way between 34 and 260; critic: two places; return as it is
     assert heights == [[34.0, 260.0, 34.0], [147.0, 34.0, 147.0], [260.0, 260.0, 260.0]]
     assert ">seed<" not in drawing and "model.critic" in drawing
+
+
+def test_a_run_without_a_return_has_no_place_on_its_axis(tmp_path: Path) -> None:
+    for job, (lr, value) in enumerate([(0.1, 5.0), (0.2, math.nan)]):
+        write_run(tmp_path / str(job), [f"ppo.lr={lr}"], rows_of([1], [value]), ppo__lr=lr)
+    points = re.findall(r"points='([^']*)'", parallel_coordinates(read_runs([str(tmp_path)])[0]))
+    assert sorted(len(line.split()) for line in points) == [1, 2]
 
 
 # A run that trains

@@ -12,7 +12,7 @@ from test_self_play import matrix_game
 from test_train import BATCH, TINY, options, rows
 
 from mappo_unity.cli import train_main
-from mappo_unity.config.schema import CuriosityConfig, EnvConfig, Optimizer, PPOConfig, RewardsConfig
+from mappo_unity.config.schema import Backend, CuriosityConfig, EnvConfig, Optimizer, PPOConfig, RewardsConfig
 from mappo_unity.policies.onnx_policy import OnnxPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import NewFolder, create_folder, discard_folder
@@ -183,6 +183,28 @@ def test_self_play_that_begins_with_resume_counts_from_there(tmp_path: Path) -> 
     steps = sorted(checkpoint.step_of(path) for path in (tmp_path / "pool").iterdir())
     assert steps[0] == begun and all(later - step >= 100 for step, later in zip(steps, steps[1:]))
     assert sides[0] == 0  # it learns for 100 steps first
+
+
+def test_without_snapshots_nothing_pending_is_carried_over_and_agents_may_be_more(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
+    from mappo_unity.training.setup import TrainingSetup
+
+    env = EnvConfig(name="Two", backend=Backend.custom, factory="taking_turns:make", params={"num_agents": 4})
+    cfg = options(3, env=env, export_onnx=False)
+    carried: list[Any] = []
+    learn = TrainingSetup.learn
+
+    def look(setup: Any, *arguments: Any, **options: Any) -> Any:
+        carried.extend(learner.carried.rounds for learner in setup.learners.values())
+        return learn(setup, *arguments, **options)
+
+    monkeypatch.setattr(TrainingSetup, "learn", look)
+    train(cfg, tmp_path, after_iteration=stop_after(2))
+    assert carried[0] is None and carried[1] is not None  # they ask at their own pace
+    cfg.env.params = {"num_agents": 6}
+    train(cfg, tmp_path, checkpoint.newest_good(tmp_path)[0], stop_after(3))
+    assert carried[2] is None
 
 
 def _nothing() -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import signal
 import sys
 from pathlib import Path
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 _SEEDS = 10_000  # of those that ML-Agents draws where none is given
 _MOST_ROLLED_BACK = 4
 _FIXED = ("env", "recipe", "seed", "env.num_areas")
+_PLACES = {"hydra.run.dir": "--run-id=NAME", "output_dir": "--results-dir=FOLDER", "resume": "--resume"}
+"""Options of ours that say where a run lies, and the flags that do so here."""
+_ENVIRONMENT = re.compile(r"env\.(?!params\b)")
 """Options of a run that a resumed one keeps."""
 
 
@@ -41,6 +45,8 @@ def run(lines: list[str]) -> int:
     translation = translate(settings)
     own = literal_lines(flags.options, Config)
     for key in given_options(own):  # its value comes from the command line
+        if key in _PLACES:
+            raise ConfigError(f"{key} does not go with mappo-learn, whose flag is {_PLACES[key]}")
         translation.sources.pop(key, None)
 
     options = [*translation.lines, *own]
@@ -118,7 +124,8 @@ def _train(settings: Settings, translation: Translation, options: list[str], fol
     run = settings.run
     resume, force = _resumes(settings), run["checkpoint_settings.force"]
     results.check_place(folder, resume, force)
-    lines = _run_lines(settings, options, folder, resume)
+    own = options[len(translation.lines) :]
+    lines = _run_lines(settings, translation.lines, own, folder, resume)
     try:
         with interrupts_wait():
             if not resume:
@@ -129,7 +136,9 @@ def _train(settings: Settings, translation: Translation, options: list[str], fol
         raise translation.explain(error) from error
 
 
-def _run_lines(settings: Settings, options: list[str], folder: Path, resume: bool) -> list[str]:
+def _run_lines(
+    settings: Settings, translated: list[str], own: list[str], folder: Path, resume: bool
+) -> list[str]:
     """Return all lines of a run: below the options where it goes and what it begins with."""
     from mappo_unity.config.mlagents.environment import scene_of
     from mappo_unity.config.overrides import last_value
@@ -137,6 +146,9 @@ def _run_lines(settings: Settings, options: list[str], folder: Path, resume: boo
     from mappo_unity.runs.results import LOGS
 
     if resume:
+        if settings.run["env_settings.env_path"] is None:  # where it was, not the Editor
+            translated = [line for line in translated if not _ENVIRONMENT.match(line)]
+        options = [*translated, *own]
         names = [line.partition("=")[0] for line in options]
         kept = [
             line
@@ -145,6 +157,7 @@ def _run_lines(settings: Settings, options: list[str], folder: Path, resume: boo
         ]
         return [*kept, f"resume={quoted_path(folder)}"]
 
+    options = [*translated, *own]
     lines = [f"hydra.run.dir={quoted_path(folder)}", *_beginning(settings)]
     if settings.run["env_settings.seed"] < 0 and last_value(options, "seed") is None:
         seed = random.SystemRandom().randrange(_SEEDS)
@@ -157,6 +170,7 @@ def _run_lines(settings: Settings, options: list[str], folder: Path, resume: boo
 
 def _beginning(settings: Settings) -> list[str]:
     """Return what --initialize-from says: a run of ours, or the ONNX files of one of mlagents-learn."""
+    from mappo_unity.config.behavior_lines import written
     from mappo_unity.config.text_lines import quoted_path
     from mappo_unity.runs.folder import CONFIG, runs_below
 
@@ -174,7 +188,8 @@ def _beginning(settings: Settings) -> list[str]:
             f"--initialize-from={name}: {source} holds neither a run nor an ONNX file of each behavior"
             f"{runs_below(source.parent)}"
         )
-    return [f"behaviors.{behavior}.init_from={quoted_path(path)}" for behavior, path in files.items()]
+    starts = {behavior: {"init_from": str(path)} for behavior, path in files.items()}
+    return [f"behaviors={written(starts)}"]
 
 
 def _check(lines: list[str]) -> None:

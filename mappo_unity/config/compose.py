@@ -177,21 +177,29 @@ def check_effect(lines: list[str], configs: list[Config]) -> None:
 
 
 def _keep_parameters_whole(tree: DictConfig, lines: list[str]) -> None:
-    """Put samplers and curricula of the command line in the place of others, whose keys Hydra mixes in."""
+    """Put parameters of the command line in the place of others, whose keys Hydra mixes in: the last wins.
+
+    What is neither a number nor a sampler nor a curriculum, but holds keys, is mixed as Hydra does it.
+    """
     root = "env.params"
     for override in parse(lines):
         key = override.key_or_group
-        value: Any = override.value()
-        if override.is_delete() or key != root and not key.startswith(f"{root}."):
+        value: Any = None if override.is_delete() else override.value()
+        if key != root and not key.startswith(f"{root}."):
             continue
 
         name = key[len(root) + 1 :]
+        if override.is_delete():
+            if name and "." not in name:
+                with open_dict(tree):
+                    tree.env.params.pop(name, None)
+            continue
         if "." in name:  # one key of a parameter, as given behind the whole
             OmegaConf.update(tree, key, value, force_add=True)
             continue
 
         for parameter, raw in ({name: value} if name else value or {}).items():
-            if is_sampler(raw) or is_curriculum(raw):
+            if not isinstance(raw, dict) or is_sampler(raw) or is_curriculum(raw):
                 with open_dict(tree):
                     tree.env.params[parameter] = raw
 

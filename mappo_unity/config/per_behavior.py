@@ -135,6 +135,7 @@ def _merged(section: Any, own: Any, where: str) -> Any:
             close = difflib.get_close_matches(str(name), names, 3)
             hint = f"; did you mean {' or '.join(close)}?" if close else f"; there are {', '.join(names)}"
             raise ConfigError(f"{where}.{name}: there is no such option{hint}")
+    _check_values(own, where)
 
     # the new object runs the section's own checks, on the values of both
     try:
@@ -144,11 +145,10 @@ def _merged(section: Any, own: Any, where: str) -> Any:
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     except OmegaConfBaseException as error:
-        _explain(own, where)
         raise ConfigError(f"{where}: {str(error).splitlines()[0]}") from error
 
 
-def _explain(own: dict[Any, Any], where: str) -> None:
+def _check_values(own: dict[Any, Any], where: str) -> None:
     """Raise ConfigError for the first value that does not fit its option, as for options of all."""
     behavior, _, section = where.rpartition(".")
     for name, value in own.items():

@@ -73,6 +73,10 @@ class Evidence:
         values = columns.get(f"{policy}/{name}", columns.get(name, np.empty(0)))
         return values[np.isfinite(values)]
 
+    def is_frozen(self, policy: str) -> bool:
+        """Whether a policy only plays, in the newest iteration."""
+        return bool(self.column(f"{policy}/frozen")[-1:].any())
+
     @property
     def updates(self) -> int:
         """How many iterations the run has done."""

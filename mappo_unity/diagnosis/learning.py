@@ -20,7 +20,7 @@ _NEAR = 0.9  # gamma below which an end is out of sight, whatever else is learnt
 
 def from_learning(evidence: Evidence) -> Iterator[Finding]:
     """Yield what is wrong with how policies learn."""
-    names: list[str | None] = [*evidence.survey] or [None]
+    names: list[str | None] = [name for name in evidence.survey if not evidence.is_frozen(name)] or [None]
     for name in names:
         yield from _rollbacks(evidence, name)
 
@@ -67,7 +67,7 @@ def _return(evidence: Evidence) -> Finding:
         "the return has fallen" if has_fallen else "the return has not risen",
         f"{known}, after {amount(evidence.decisions)} decisions",
         "see the other findings. Without any: does the reward depend on what the agent does, can what it "
-        "needs be seen, and can a person earn it (mappo-play env=... record=run.demo)?",
+        "needs be seen, and can a person earn it (in the Editor: Behavior Type Heuristic Only)?",
     )
 
 

@@ -78,7 +78,10 @@ class CarriedRounds:
         kept = rounds[index].clone()
         mask = _like(pending[where], kept.get(VALUED))
         kept.set(VALUED, mask)
-        kept.set(keys.ACTING, kept.get(keys.ACTING) & mask)
+        # who is not pending stands there no more: not as the beginning of an episode, either
+        for key in (keys.ACTING, keys.FIRST):
+            if key in kept.keys():
+                kept.set(key, kept.get(key) & mask)
         for key in _SUMS:
             flat = rounds.get(key).cpu().numpy().reshape(len(rounds), -1)
             kept.set(key, _like(np.where(pending, view.rewards(flat), 0)[where], kept.get(key)))

@@ -203,9 +203,7 @@ def _where(mask: Tensor | None, log_ratio: Tensor) -> Tensor:
 
 @torch.no_grad()
 def move_with_minibatch(norm: ValueNorm, rows: TensorDictBase) -> None:
-    """Take a minibatch's targets into the statistics and normalise its values by them, in place."""
+    """Take a minibatch's targets into the statistics and normalise them by these, in place."""
     targets, learns = rows.get(keys.VALUE_TARGET), rows.get(CRITIC_LEARNS, None)
     norm.update(targets.flatten(0, -2) if learns is None else targets[learns.squeeze(-1)])
-    for key in (keys.VALUE_TARGET, keys.VALUE, BASELINE):
-        if key in rows.keys():
-            rows.set(key, norm.normalize(rows.get(key)))
+    rows.set(keys.VALUE_TARGET, norm.normalize(targets))

@@ -132,6 +132,10 @@ class CriticWarmup:
         self.decisions += self.reduction.total(int(batch.get(keys.ACTING).sum()))
         return {"critic_warmup": float(self.active)} if self.steps else {}
 
+    def free(self, norms: list[Any]) -> list[Any]:
+        """Return those of the actor's normalisers that may move with the next batch."""
+        return [] if self.decisions < self.steps else norms
+
     def total(self, losses: Mapping[str, Tensor]) -> Tensor:
         """Return what is minimised now."""
         if self.active:

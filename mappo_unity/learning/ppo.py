@@ -97,7 +97,8 @@ class PolicyLearner:
         self.value_layers = value_layers(critic)  # which PopArt rescales
         self.bounded = [m for m in actor.modules() if isinstance(m, Actor)]
         self.norms = [*running_norms(actor), *running_norms(critic)]
-        actor.moving_norms = running_norms(actor) if cfg.obs_norm_update is ObsNormUpdate.round else []
+        self.round_norms = running_norms(actor) if cfg.obs_norm_update is ObsNormUpdate.round else []
+        self.actor.moving_norms = self.warmup.free(self.round_norms)
         self.updates = self.rollbacks = 0  # rolled back ones are counted in both
 
     def check_joins(self, size: int) -> None:
@@ -123,8 +124,8 @@ class PolicyLearner:
         """
         settings = {"lr": self.rates.begin(progress)} | self.loss.begin(progress)
         settings |= self.rewards.begin(progress) | self.warmup.begin(batch)
-        for norm in self.norms if self.actor.moving_norms else ():
-            norm.load_state_dict(self.actor.moving_norms[0].state_dict())  # the critic's follow
+        for norm in self.norms if self.round_norms else ():
+            norm.load_state_dict(self.round_norms[0].state_dict())  # the critic's follow
 
         metrics: dict[str, float] = {}
         if self.cloning is None or not self.cloning.cfg.only:
@@ -133,9 +134,10 @@ class PolicyLearner:
             metrics |= self.rewards.learn()
         if self.cloning is not None:
             metrics |= self.cloning.learn(int(batch.get(keys.ACTING).sum()), settings["lr"], progress)
-        if not self.actor.moving_norms:
+        if not self.round_norms:
             # after the update, which must not see it
             update_norms(self.warmup.moving(self.norms), batch, self.reduction)
+        self.actor.moving_norms = self.warmup.free(self.round_norms)
         return metrics | settings
 
     @torch.no_grad()
@@ -175,14 +177,15 @@ class PolicyLearner:
         metrics |= value_metrics(self.rewards.names, values.value, gae.target, learns, self.reduction)
         enter_targets(rounds, values, gae, self.value_norm, self.value_layers, self.cfg, self.reduction)
         rows, decisions = self.rows.of(rounds, view)
-        if not self.reduction.least(len(rows)):  # where one of several learners has none, all of them wait
+        if not self.reduction.least(
+            int(decisions.sum())
+        ):  # where one of several learners has none, all of them wait
             return None, metrics
         return make_buffer(rows, decisions, self.cfg, self.reduction), metrics
 
     def update(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Run the epochs; take everything back if a number is not finite or the KL explodes."""
         before = cloned(self._trainable_state())
-
         sums: dict[str, Tensor] = {}
         steps, kl_epoch, stopped = 0, 0.0, False
         for _ in range(self.cfg.epochs):
@@ -262,8 +265,7 @@ class PolicyLearner:
     def _load_trainable(self, state: dict[str, Any]) -> None:
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
-        actor_size = len(list(self.actor.parameters()))
-        load_optimizer(self.optimizer, in_two_groups(state["optimizer"], actor_size))
+        load_optimizer(self.optimizer, in_two_groups(state["optimizer"], len([*self.actor.parameters()])))
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that resuming needs."""
@@ -292,6 +294,7 @@ class PolicyLearner:
         self.carried.load_state_dict(state.get("carried"), self.params[0].device)
         self.reader.load_state_dict(state.get("critic_states", {}))
         self.rollbacks, self.warmup.decisions = int(state["rollbacks"]), int(state.get("decisions", 0))
+        self.actor.moving_norms = self.warmup.free(self.round_norms)
         self.updates = int(state.get("updates", self.rollbacks))  # written since 0.2
         if self.cfg.lr_target_kl is not None:  # else the options have it that nothing steers
             self.rates.scale = float(state.get("lr_scale", 1.0))  # since 0.3

@@ -83,7 +83,8 @@ class SequenceRows:
     def of(self, rounds: TensorDict, view: DecisionView) -> tuple[TensorDictBase, Tensor]:
         """Return where the sequences stand, and how many decisions each holds, int64 ``[B]``."""
         learns = rounds.get(ACTOR_LEARNS)
-        flat = [rounds.get(key).cpu().numpy().reshape(len(rounds), -1) for key in (keys.FIRST, ACTOR_LEARNS)]
+        # those of departed members, too: only the critic learns there
+        flat = [rounds.get(key).cpu().numpy().reshape(len(rounds), -1) for key in (keys.FIRST, CRITIC_LEARNS)]
         found = cut_sequences(view, flat[0], flat[1], self._length)
 
         # sides and teams become one dimension

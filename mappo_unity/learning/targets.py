@@ -46,11 +46,14 @@ def enter_targets(
         cfg: the learner's options.
         reduction: of several learners.
     """
-    # values were denormalised, and are normalised below: the statistics move in between
+    # Clipping is around what the critic said: PopArt rescales that with the statistics, nothing else does.
     by_minibatch = cfg.value_norm_update is ValueNormUpdate.minibatch
+    rescaled = layers if cfg.normalize_values is ValueNormKind.popart else ()
+    said = [x if x is None else norm.normalize(x) for x in (values.value, values.baseline)]
     if not by_minibatch:
-        rescaled = layers if cfg.normalize_values is ValueNormKind.popart else ()
         move_statistics(norm, gae.target[gae.known.squeeze(-1)], rescaled)
+    if rescaled:
+        said = [x if x is None else norm.normalize(x) for x in (values.value, values.baseline)]
 
     advantage = gae.advantage
     if values.baseline is not None:
@@ -60,10 +63,9 @@ def enter_targets(
     if cfg.normalize_advantages:
         advantage = normalize(advantage, rounds.get(ACTOR_LEARNS), reduction=reduction)
 
-    # where the statistics move with each minibatch, it normalises these itself
-    scaled = (lambda x: x) if by_minibatch else norm.normalize
+    # where the statistics move with each minibatch, it normalises its targets itself
     rounds.set(keys.ADVANTAGE, advantage)
-    rounds.set(keys.VALUE_TARGET, scaled(gae.target))
-    rounds.set(keys.VALUE, scaled(values.value))
-    if values.baseline is not None:
-        rounds.set(BASELINE, scaled(values.baseline))
+    rounds.set(keys.VALUE_TARGET, gae.target if by_minibatch else norm.normalize(gae.target))
+    for key, output in zip((keys.VALUE, BASELINE), said):
+        if output is not None:
+            rounds.set(key, output)

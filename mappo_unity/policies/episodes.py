@@ -105,14 +105,14 @@ class _Counts:
 
     def __init__(self, wanted: int, skips: bool) -> None:
         self.wanted, self.skips = wanted, skips
-        self.begun: dict[str, int] = {}
+        self.begun: dict[str, int] = {}  # of those that count
         self.ended: dict[str, list[Episode]] = {}
 
     def begin(self, name: str) -> bool:
-        if self.skips:
+        if self.skips or self.begun.get(name, 0) >= self.wanted:
             return False
         self.begun[name] = self.begun.get(name, 0) + 1
-        return self.begun[name] <= self.wanted
+        return True
 
     def complete(self, names: list[str]) -> bool:
         return all(len(self.ended.get(name, [])) >= self.wanted for name in names)
@@ -184,7 +184,7 @@ def summarize(episodes: list[Episode]) -> dict[str, Any]:
 
 
 def standard_error(values: np.ndarray, teams: bool = False) -> float:
-    """Return the standard error of the mean of episodes' returns, in the order of their ends.
+    """Return the standard error of the mean of episodes' returns, in the order of their ends; NaN of one.
 
     Team mates earn the same and end together, so for teams it is taken from the means of consecutive
     batches (batch means; Law and Kelton, Simulation Modeling and Analysis) as long as there are some.
@@ -192,6 +192,5 @@ def standard_error(values: np.ndarray, teams: bool = False) -> float:
     if teams and len(values) >= 2 * MIN_BATCH:
         batches = np.array_split(values, min(NUM_BATCHES, len(values) // MIN_BATCH))
         values = np.array([batch.mean() for batch in batches])
-        return float(values.std(ddof=1) / math.sqrt(len(values)))
 
-    return float(values.std() / math.sqrt(len(values)))
+    return float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.nan

@@ -3,13 +3,14 @@
 A side is a team id (``Name?team=1``): its behaviors belong to one policy.
 
 A match is one episode of a team. The side whose group reward (individual reward where there are no
-groups) is positive at its end has won, one with a negative one has lost; anything else is a draw.
+groups) is positive at its end, that of its last member, has won, one with a negative one has lost;
+anything else is a draw.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,31 +120,41 @@ def play_side(
     members = max(1, int((groups == groups[0]).sum())) if groups[0] > 0 else 1
     # Each member of a team has an agent episode of its own in every match.
     episodes = play(env, policies, matches * members, only=name, skip_first=is_used)[name]
-    return count(episodes, grouped=bool(groups[0] > 0))
+    return count(episodes, members if groups[0] > 0 else None)
 
 
-def count(episodes: list[Episode], grouped: bool) -> Score:
-    """Sum up the outcomes; of the members of a team the first to end in a match speaks for it."""
+def count(episodes: list[Episode], members: int | None) -> Score:
+    """Sum up the outcomes of matches.
+
+    Args:
+        episodes: in the order of their ends.
+        members: of a team, each of which has an episode in a match; None: there are no teams.
+    """
     score = Score()
-    ends_of: dict[tuple[int, int], int] = {}
-    seen: set[tuple[int, int]] = set()
-
-    for episode in episodes:
-        if grouped:
-            # An agent's n-th end belongs to the n-th match of its group.
-            agent = (episode.group_id, episode.agent_id)
-            ends_of[agent] = ends_of.get(agent, 0) + 1
-            match = (episode.group_id, ends_of[agent])
-            if match in seen:
-                continue
-            seen.add(match)
-
-        outcome = episode.group_return if grouped else episode.individual_return
+    for episode in episodes if members is None else _last_of_teams(episodes, members):
+        outcome = episode.individual_return if members is None else episode.group_return
         result = int(outcome > 0) - int(outcome < 0)
         length = episode.length
         score += Score(int(result > 0), int(result == 0), int(result < 0), length, ((result, length),))
 
     return score
+
+
+def _last_of_teams(episodes: list[Episode], members: int) -> Iterator[Episode]:
+    """Yield the episode that ended last of each match of a team.
+
+    A member that was out earlier has not earned what came for the team afterwards; and one that is back in
+    the next match may have another id.
+    """
+    last: dict[int, Episode] = {}  # of the matches that are not over, by group
+    ends = dict[int, int]()
+    for episode in episodes:
+        group = episode.group_id
+        last[group], ends[group] = episode, ends.get(group, 0) + 1
+        if ends[group] == members:
+            ends[group] = 0
+            yield last.pop(group)
+    yield from last.values()  # of some members that began before so many matches had begun
 
 
 def have_parts(sides: Iterable[str]) -> bool:

@@ -69,6 +69,8 @@ class _Axis:
 
     def share(self, number: int) -> float:
         """Return how high a run's value lies, 0 to 1; NaN without one."""
+        if not math.isfinite(self._values[number]):
+            return math.nan
         return 0.5 if self._is_single else float((self._values[number] - self._low) / self._span)
 
     def place(self, number: int) -> float:

@@ -6,6 +6,7 @@ that somebody wrote by hand is never taken for it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -48,7 +49,8 @@ class LastWindow:
     """What the run itself said of its last episodes before the checkpoint."""
 
     mean_return: float
-    win_rate: float | None = None
+    win_rate: float | None = None  # of the decided matches against random; NaN: none was
+    draw_rate: float | None = None
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ def merged(cards: Sequence[str]) -> str:
 
     parts = [split(card) for card in cards]
     front = parts[0][0] | {"tags": list(dict.fromkeys(tag for head, _ in parts for tag in _tags(head)))}
-    index = [entry for head, _ in parts for entry in head.get("model-index", [])]
+    index = [entry for head, _ in parts for entry in head.get("model-index") or []]
     return joined(front | ({"model-index": index} if index else {}), "\n".join(body for _, body in parts))
 
 
@@ -162,7 +164,8 @@ def _front_matter(facts: Facts) -> dict[str, Any]:
 def _metric(score: Earned | Won | LastWindow | None) -> dict[str, Any] | None:
     """Return the measured score in the hub's form; what training said of itself is no measurement."""
     if isinstance(score, Earned):
-        value = f"{score.mean:.4g} +/- {score.stderr:.2g}"
+        error = "" if math.isnan(score.stderr) else f" +/- {score.stderr:.2g}"
+        value = f"{score.mean:.4g}{error}"
         return {"type": "mean_reward", "name": "mean_reward", "value": value, "verified": False}
     if isinstance(score, Won) and score.wins + score.losses:
         name = "share won against random"
@@ -195,6 +198,8 @@ def _cell(text: str) -> str:
 
 def _score(score: Earned | Won | LastWindow | None) -> str:
     if isinstance(score, Earned):
+        if math.isnan(score.stderr):
+            return f"Return {score.mean:.4g} in one episode of an agent, with sampled actions."
         low, high = score.mean - Z95 * score.stderr, score.mean + Z95 * score.stderr
         return (
             f"Mean return {score.mean:.4g}, standard error {score.stderr:.2g}, 95 % interval {low:.4g} to "
@@ -215,7 +220,10 @@ def _score(score: Earned | Won | LastWindow | None) -> str:
     if isinstance(score, LastWindow):
         said = f"the mean return of its last training episodes was {score.mean_return:.4g}"
         if score.win_rate is not None:
-            said = f"its last matches against random while training were won to {100 * score.win_rate:.1f} %"
+            drawn = "" if score.draw_rate is None else f", {100 * score.draw_rate:.1f} % of all drawn"
+            won = f"won {100 * score.win_rate:.1f} % of the decided ones{drawn}"
+            won = "decided none" if math.isnan(score.win_rate) else won
+            said = f"in its last matches against random while training it {won}"
         return f"Not evaluated: {said}, which is no measurement of the finished policy."
 
     return "Not evaluated."

@@ -181,7 +181,13 @@ def _last_window(trained: Trained, policy: str) -> LastWindow | None:
     columns = rows[-1] if rows else {}
     own = [name for name in columns if name.endswith("/return_mean") and _policy(name) == policy]
     mean = _last(rows, *own, "return_mean")
-    return None if mean is None else LastWindow(mean, _last(rows, "win_rate_vs_random"))
+    if mean is None:
+        return None
+
+    series = next((row for row in reversed(rows) if "draw_rate_vs_random" in row), None)
+    if series is None:
+        return LastWindow(mean)
+    return LastWindow(mean, series.get("win_rate_vs_random", math.nan), series["draw_rate_vs_random"])
 
 
 def _policy(column: str) -> str:

@@ -85,7 +85,7 @@ class TrainingSetup:
 
         self.frozen = {name for name in self.learners if is_frozen(self.cfg, name)}
         for name in self.frozen:
-            self.learners[name].actor.moving_norms = []
+            self.learners[name].round_norms = self.learners[name].actor.moving_norms = []
         check_learners(self.cfg, self.env, self._learning)
 
     @property

@@ -48,7 +48,7 @@ examples:
   mappo-learn 3DBall.yaml --run-id=ball --env=builds/3DBall       a Unity build
   mappo-learn 3DBall.yaml --run-id=ball                           the Editor: press Play
   mappo-learn 3DBall.yaml --run-id=ball --env=scene:3DBall        an embedded scene, without Unity
-  mappo-learn 3DBall.yaml --run-id=ball --resume
+  mappo-learn 3DBall.yaml --run-id=ball --resume                  where the run was trained
   mappo-learn 3DBall.yaml --env=scene:3DBall ppo.epochs=4         an option of mappo-train beats all
 """
 
@@ -85,6 +85,8 @@ def parse_flags(arguments: list[str]) -> Flags:
 
     known = vars(_parser().parse_intermixed_args(arguments))
     words = known.pop("words")
+    if known.pop("env_args") is not None:
+        raise ConfigError(f"{_ENV_ARGS} is written {_ENV_ARGS} WORD ... at the end of the line")
     flags = Flags(options=[word for word in words if "=" in word])
     files = [word for word in words if "=" not in word]
     if len(files) > 1:

@@ -66,7 +66,7 @@ def checked(value: Any, key: Key, where: str) -> Any:
     if key.kind == FLAG:
         fits = isinstance(value, bool)
     elif key.kind in (WHOLE, NUMBER):
-        number = _number(value)
+        number = as_number(value)
         fits = number is not None and (key.kind == NUMBER or number.is_integer())
         if fits and number is not None:
             value = number if key.kind == NUMBER else int(number)
@@ -86,12 +86,13 @@ def checked(value: Any, key: Key, where: str) -> Any:
     return value
 
 
-def _number(value: Any) -> float | None:
+def as_number(value: Any) -> float | None:
+    """Return a number or a text that is one as a finite number; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return None
     try:
         number = float(value)  # YAML takes 5e5 for a text
-    except ValueError:
+    except (ValueError, OverflowError):  # of a whole number of hundreds of digits
         return None
     return number if math.isfinite(number) else None
 

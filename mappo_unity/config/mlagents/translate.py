@@ -15,12 +15,14 @@ from mappo_unity.config.mlagents.behavior import (
     learner_options,
 )
 from mappo_unity.config.mlagents.environment import MANY, environment_options
-from mappo_unity.config.mlagents.settings import Section, Settings
+from mappo_unity.config.mlagents.settings import Section, Settings, as_number
 from mappo_unity.config.parameters.values import PLAYERS, read_parameters
 from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_-]+")
+_WORDS = ("name", "behavior", "measure", "sampler_type")  # keys of environment_parameters that are texts
+_WHOLE = ("min_lesson_length", "seed")  # and those that are whole numbers
 _SIMPLE = re.compile(r"(?!null$|true$|false$|inf$|nan$)[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -167,6 +169,8 @@ def _learners(sections: dict[str, Section], default: Section | None) -> tuple[Op
     trees: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for name, options in own.items():
+        if "init_from" in common and "init_from" not in options:  # init_path: null
+            options["init_from"] = (None, sections[name].where("init_path"))
         differing = {key: v for key, v in options.items() if key not in common or common[key][0] != v[0]}
         if _PLAIN_NAME.fullmatch(name) and differing:
             out |= {f"behaviors.{name}.{key}": value for key, value in differing.items()}
@@ -195,16 +199,37 @@ def _tree(options: Options) -> dict[str, Any]:
 
 def _parameters(settings: Settings, warnings: list[str]) -> Options:
     out: Options = {}
+    others: dict[str, Any] = {}
     for name, given in settings.parameters.items():
-        value = given.value
+        value = _with_numbers(given.value)
         warnings += _about_lessons(given.where, value)
         try:
             read_parameters({name: value}, PLAYERS)
         except ConfigError as error:
             rest = str(error).removeprefix(f"env.params.{name}")
             raise ConfigError(f"{settings.places(name, rest)}{rest}") from error
-        out[f"env.params.{name}"] = (value, given.where)
+        if _PLAIN_NAME.fullmatch(name):
+            out[f"env.params.{name}"] = (value, given.where)
+        else:  # a name with dots and the like
+            others[name] = value
+    if others:
+        out["env.params"] = (others, "environment_parameters")
     return out
+
+
+def _with_numbers(value: Any, key: str = "") -> Any:
+    """Return a parameter's value with numbers for texts such as 1e-3, which YAML takes for no number."""
+    if isinstance(value, dict):
+        return {name: _with_numbers(item, str(name)) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_with_numbers(item, key) for item in value]
+    if key in _WORDS or not isinstance(value, str | float):
+        return value
+
+    number = as_number(value)
+    if number is None:
+        return value
+    return int(number) if key in _WHOLE and number.is_integer() else number
 
 
 def _about_lessons(where: str, value: Any) -> Iterator[str]:

@@ -83,9 +83,13 @@ def read_number(where: str, raw: Any, wanted: str = "a number") -> float:
     """Return a finite number; raise ConfigError, which says what is `wanted`."""
     if isinstance(raw, bool) or not isinstance(raw, (int, float)):
         raise ConfigError(f"{where}={show_value(raw)} must be {wanted}")
-    if not math.isfinite(raw):
+    try:
+        number = float(raw)
+    except OverflowError:  # a whole number of hundreds of digits
+        number = math.inf
+    if not math.isfinite(number):
         raise ConfigError(f"{where}={show_value(raw)} must be finite")
-    return float(raw)
+    return number
 
 
 def check_keys(where: str, raw: dict[Any, Any], known: Iterable[str]) -> None:

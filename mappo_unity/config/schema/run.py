@@ -8,7 +8,7 @@ from enum import Enum
 from typing import Any, Optional
 
 from mappo_unity.config.parameters.values import curricula
-from mappo_unity.config.schema.checks import at_least, rule, within
+from mappo_unity.config.schema.checks import at_least, not_empty, rule, within
 from mappo_unity.config.schema.collect import CollectConfig
 from mappo_unity.config.schema.env import Backend, EnvConfig
 from mappo_unity.config.schema.log import LogConfig
@@ -87,6 +87,7 @@ class Config:
     """Folder under which run folders are made."""
 
     def __post_init__(self) -> None:
+        not_empty(output_dir=self.output_dir.strip())
         within("seed", self.seed, 0, 2**31 - 1)
         at_least("max_steps", self.max_steps, 1)
         at_least("checkpoint_interval", self.checkpoint_interval, 1)

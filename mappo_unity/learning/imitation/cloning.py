@@ -52,11 +52,12 @@ class Cloning:
             progress: share of the run that is over, 0 to 1.
         """
         left = share_left(self.cfg.steps, self._max_steps, progress)
-        if left == 0.0:
-            return {"bc_strength": 0.0}
+        wanted = decisions if self.cfg.only else min(decisions, len(self._expert))
+        # a side that pauses, or a behavior that was not asked, has no decision in a batch
+        if left == 0.0 or not wanted:
+            return {"bc_strength": self.cfg.strength * left}
 
         self.optimizer.param_groups[0]["lr"] = lr * self.cfg.strength * left
-        wanted = decisions if self.cfg.only else min(decisions, len(self._expert))
         losses = []
         for _ in range(self._ppo.epochs):
             states = self._states() if self._actor.has_memory else None

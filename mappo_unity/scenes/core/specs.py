@@ -96,10 +96,17 @@ def known_parameter(scene: str, known: Mapping[str, Parameter], name: str) -> Pa
     )
 
 
+def _is_finite(value: numbers.Real) -> bool:
+    try:
+        return math.isfinite(float(value))
+    except OverflowError:  # a whole number of hundreds of digits
+        return False
+
+
 def checked_parameter(scene: str, known: Mapping[str, Parameter], name: str, value: object) -> float:
     """Return `value` as a float; raise `ConfigError` unless it is a number that the parameter can have."""
     known_parameter(scene, known, name)
-    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(float(value)):
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not _is_finite(value):
         raise ConfigError(
             f"parameter {name}={show_value(value)} of scene {scene} must be a finite number (or, in options, "
             "a sampler {sampler: ...} or a curriculum {lessons: [...]})"
