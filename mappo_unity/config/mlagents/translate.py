@@ -83,7 +83,7 @@ def translate(settings: Settings) -> Translation:
 def _line_value(key: str, value: Any) -> str:
     if isinstance(value, str) and (key == "env" or _SIMPLE.fullmatch(value)):
         return value
-    if key == "env.file_name" or key.rpartition(".")[2] == "init_from":
+    if isinstance(value, str) and (key == "env.file_name" or key.rpartition(".")[2] == "init_from"):
         return quoted_path(value)
     return written(value)
 
