@@ -23,7 +23,9 @@ _MOST_ROLLED_BACK = 4
 _FIXED = ("env", "recipe", "seed", "env.num_areas")
 _PLACES = {"hydra.run.dir": "--run-id=NAME", "output_dir": "--results-dir=FOLDER", "resume": "--resume"}
 """Options of ours that say where a run lies, and the flags that do so here."""
-_ENVIRONMENT = re.compile(r"env\.(?!params\b)")
+_OF_PLACES = re.compile(r"env\.(backend|port)=")
+_OF_SCENES = re.compile(r"env\.(?!params\b)")
+"""Lines that say where a run is trained: in a player or the Editor, and in a scene, which has no other."""
 """Options of a run that a resumed one keeps."""
 
 
@@ -140,14 +142,19 @@ def _run_lines(
     settings: Settings, translated: list[str], own: list[str], folder: Path, resume: bool
 ) -> list[str]:
     """Return all lines of a run: below the options where it goes and what it begins with."""
+    from mappo_unity.config.compose import load_config
     from mappo_unity.config.mlagents.environment import scene_of
     from mappo_unity.config.overrides import last_value
+    from mappo_unity.config.schema import Backend
     from mappo_unity.config.text_lines import quoted_path
+    from mappo_unity.runs.folder import CONFIG
     from mappo_unity.runs.results import LOGS
 
     if resume:
-        if settings.run["env_settings.env_path"] is None:  # where it was, not the Editor
-            translated = [line for line in translated if not _ENVIRONMENT.match(line)]
+        if settings.run["env_settings.env_path"] is None:  # where it was trained, not the Editor
+            env = load_config(folder / CONFIG).env
+            other = _OF_SCENES if env.backend is Backend.embedded else _OF_PLACES
+            translated = [line for line in translated if not other.match(line)]
         options = [*translated, *own]
         names = [line.partition("=")[0] for line in options]
         kept = [

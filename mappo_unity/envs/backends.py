@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mappo_unity.config.option_table import show_value
 from mappo_unity.config.parameters.values import later_values, values_at
@@ -21,6 +21,9 @@ from mlagents_envs.base_env import BaseEnv  # noqa: E402
 
 from mappo_unity.scenes.factory import call_factory, explain_error, load_factory  # noqa: E402
 from mappo_unity.scenes.user_env import GuardedEnv  # noqa: E402
+
+if TYPE_CHECKING:
+    from mappo_unity.protocol.player_options import PlayerOptions
 
 MakeEnv = Callable[[int], BaseEnv]
 
@@ -82,25 +85,10 @@ def _embedded(cfg: EnvConfig, is_staggered: bool) -> MakeEnv:
 def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
     from mappo_unity.protocol.client import UnityPlayer
     from mappo_unity.protocol.parallel_players import SeveralPlayers
-    from mappo_unity.protocol.player_options import PlayerOptions
     from mappo_unity.protocol.restarting_player import RestartingPlayer
 
     executable = find_player(cfg)
     folder = _log_folder(cfg, log_folder)
-
-    def options(log_name: str) -> PlayerOptions:
-        return PlayerOptions(
-            executable,
-            folder / log_name,
-            # only the Editor must be told its port; for players the system picks a free one (0)
-            port=cfg.port or EDITOR_PORT if cfg.backend is Backend.editor else 0,
-            timeout_s=cfg.timeout_s,
-            arguments=list(cfg.player_args),
-            no_graphics=cfg.no_graphics,
-            num_areas=cfg.num_areas or 1,
-            parameters=values_at(cfg.parameters, {}),
-            engine=_engine(cfg),
-        )
 
     def start(number: int, seed: int) -> RestartingPlayer:
         name = f"player {number}" if cfg.num_players > 1 else _describe(cfg)
@@ -113,7 +101,7 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
         def make_player(own_seed: int) -> UnityPlayer:
             restart = next(restarts)
             log_name = f"Player-{number}-restart-{restart}.log" if restart else f"Player-{number}.log"
-            return UnityPlayer(options(log_name), own_seed)
+            return UnityPlayer(_player_options(cfg, executable, folder / log_name), own_seed)
 
         return RestartingPlayer(make_player, first, cfg.max_restarts, name)
 
@@ -134,6 +122,23 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
         return players[0] if cfg.num_players == 1 else SeveralPlayers(players)
 
     return make
+
+
+def _player_options(cfg: EnvConfig, executable: Path | None, log_file: Path) -> PlayerOptions:
+    from mappo_unity.protocol.player_options import PlayerOptions
+
+    return PlayerOptions(
+        executable,
+        log_file,
+        # only the Editor must be told its port; for players the system picks a free one (0)
+        port=cfg.port or EDITOR_PORT if cfg.backend is Backend.editor else 0,
+        timeout_s=cfg.timeout_s,
+        arguments=list(cfg.player_args),
+        no_graphics=cfg.no_graphics,
+        num_areas=cfg.num_areas or 1,
+        parameters=values_at(cfg.parameters, {}),
+        engine=_engine(cfg),
+    )
 
 
 def find_player(cfg: EnvConfig) -> Path | None:

@@ -177,9 +177,8 @@ class PolicyLearner:
         metrics |= value_metrics(self.rewards.names, values.value, gae.target, learns, self.reduction)
         enter_targets(rounds, values, gae, self.value_norm, self.value_layers, self.cfg, self.reduction)
         rows, decisions = self.rows.of(rounds, view)
-        if not self.reduction.least(
-            int(decisions.sum())
-        ):  # where one of several learners has none, all of them wait
+        # where one of several learners has no decision, all of them wait
+        if not self.reduction.least(int(decisions.sum())):
             return None, metrics
         return make_buffer(rows, decisions, self.cfg, self.reduction), metrics
 
