@@ -419,6 +419,8 @@ def test_a_mistake_is_one_line_with_file_line_and_key(tmp_path, monkeypatch, cap
         (["--env=scene:3DBall", "hydra.run.dir=x"], "hydra.run.dir does not go with mappo-learn, whose flag"),
         (["--env=scene:3DBall", "output_dir=x"], "output_dir does not go with mappo-learn"),
         (["--run-id=none", "resume=x"], "resume does not go with mappo-learn, whose flag is --resume"),
+        (["--run-id=a", "--initialize-from=a/b"], "--initialize-from=a/b must be the name of a folder"),
+        (["--run-id=a/b", "--env-args", "--help", "-h", "--version"], "--run-id=a/b must be the name"),
         (["--env-args=foo"], "--env-args is written --env-args WORD ..."),
     ],
 )

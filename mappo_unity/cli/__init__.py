@@ -21,6 +21,7 @@ from contextlib import suppress
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.signals import interrupts_wait
 
+ENV_ARGS = "--env-args"  # of mappo-learn: what follows it is the player's
 _NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """What a file system refuses for reasons of its own."""
 
@@ -123,11 +124,12 @@ def _run(command: str, arguments: list[str] | None) -> int:
 
 
 def _answer(command: str, name: str, lines: list[str]) -> int:
-    if any(line in ("--help", "-h") for line in lines):
+    own = lines[: lines.index(ENV_ARGS)] if ENV_ARGS in lines else lines
+    if any(line in ("--help", "-h") for line in own):
         print(importlib.import_module(f"{__name__}.{command}").help_text())
         return 0
 
-    if "--version" in lines:
+    if "--version" in own:
         from mappo_unity import __version__
 
         print(f"{name} {__version__}")

@@ -114,9 +114,9 @@ def _folder(settings: Settings) -> Path:
     return _run_folder(settings, settings.run["checkpoint_settings.run_id"])
 
 
-def _run_folder(settings: Settings, name: str) -> Path:
+def _run_folder(settings: Settings, name: str, flag: str = "--run-id") -> Path:
     if name in ("", ".", "..") or Path(name).name != name:
-        raise ConfigError(f"--run-id={name} must be the name of a folder, without others above it")
+        raise ConfigError(f"{flag}={name} must be the name of a folder, without others above it")
     return Path(settings.run["checkpoint_settings.results_dir"]) / name
 
 
@@ -185,7 +185,7 @@ def _beginning(settings: Settings) -> list[str]:
     if name is None:
         return []
 
-    source = _run_folder(settings, name)
+    source = _run_folder(settings, name, "--initialize-from")
     if (source / CONFIG).is_file():
         return [f"init_from={quoted_path(source)}"]
 
