@@ -245,7 +245,7 @@ class RunState:
         self.matches.load_state_dict(state["matches"], state["best_score"])
         # a run may take up self-play, or leave it, when it is resumed
         if self.self_play is not None and (known := state.get("self_play")) is not None:
-            self.self_play.load_state_dict(known, state["agent_steps"], is_new, self.notes.append)
+            self.self_play.load_state_dict(known, state["agent_steps"], self.notes.append)
         for name in _COUNTERS:
             setattr(self, name, state[name])
 

@@ -125,6 +125,13 @@ def split_players(players: Players, parts: Sequence[Played]) -> tuple[Players, .
     )
 
 
+def fits_teams(players: Players, parts: Sequence[Played]) -> bool:
+    """Return whether players are of as many teams as all workers have."""
+    return all(
+        joint.shape[-1] == sum(_teams(part, name) for part in parts) for name, joint in players.items()
+    )
+
+
 def _teams(part: Played, name: str) -> int:
     return part.behaviors[part.sides[name][0]].slots.num_teams
 

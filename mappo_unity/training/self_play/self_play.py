@@ -28,6 +28,7 @@ from mappo_unity.training.collection.lineups import (
     Lineup,
     Network,
     count_pairs,
+    fits_teams,
     make_player,
     players_of_pairs,
     split_players,
@@ -244,14 +245,11 @@ class SelfPlay:
             "at": [self._saved_at, self._drawn_at, self._changed_at],
         }
 
-    def load_state_dict(
-        self, state: Mapping[str, Any], agent_steps: int, is_new: bool, say: Callable[[str], None]
-    ) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], agent_steps: int, say: Callable[[str], None]) -> None:
         """Restore what `state_dict` returned.
 
         Args:
             agent_steps: agent decisions of the run then.
-            is_new: the environment begins new episodes, perhaps with other teams: who plays is drawn anew.
             say: takes a line about each opponent that is left out.
 
         Raises:
@@ -262,7 +260,9 @@ class SelfPlay:
                 f"self_play.fixed={list(self._cfg.fixed)} cannot change with resume: the run has "
                 f"{list(state['fixed'])}"
             )
-        if not is_new:
+        # of other teams, which a player may show in new episodes, nothing is known
+        fits = fits_teams(state["opponents"]["following"], self._setup.fleet.parts)
+        if fits:
             self._opponents.load_state_dict(state["opponents"], self._device)
         self._pool.load_state_dict(state["pool"], self._used(), self._cfg.skip_missing, say)
         self._draws = int(state["draws"])
@@ -278,10 +278,10 @@ class SelfPlay:
             rows = state["records"].get(name, [])
             self._records[name] = {int(n): Record(*values) for n, *values in rows if n in there}
             self._opponents.replace(name, self._pool.all_numbers | {*self._fixed, LATEST})
-        if is_new:
-            self._draw()
-        else:
+        if fits:
             self._line_up()
+        else:
+            self._draw()
 
 
 def _two_sides(cfg: Config, setup: TrainingSetup) -> dict[int, list[str]]:
