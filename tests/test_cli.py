@@ -43,7 +43,7 @@ class FakeTraining:
     def train(self, cfg: Config, folder: Path, checkpoint: Path | None = None, *show: object) -> Outcome:
         self.calls.append((cfg, folder, checkpoint))
         if self.writes:
-            (folder / "metrics.csv").write_text("agent_steps\n")
+            (folder / "metrics.csv").write_text("agent_steps\n10\n")
         if self.error is not None:
             raise self.error
         return self.outcome
