@@ -21,7 +21,6 @@ from contextlib import suppress
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.signals import interrupts_wait
 
-ENV_ARGS = "--env-args"  # of mappo-learn: what follows it is the player's
 _NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """What a file system refuses for reasons of its own."""
 
@@ -124,7 +123,12 @@ def _run(command: str, arguments: list[str] | None) -> int:
 
 
 def _answer(command: str, name: str, lines: list[str]) -> int:
-    own = lines[: lines.index(ENV_ARGS)] if ENV_ARGS in lines else lines
+    own = lines
+    if command == "learn":
+        from mappo_unity.config.mlagents.flags import before_env_args
+
+        own = before_env_args(lines)
+
     if any(line in ("--help", "-h") for line in own):
         print(importlib.import_module(f"{__name__}.{command}").help_text())
         return 0

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 _SEEDS = 10_000  # of those that ML-Agents draws where none is given
 _MOST_ROLLED_BACK = 4
 _FIXED = ("env", "recipe", "seed", "env.num_areas")
+"""Options of a run that a resumed one keeps."""
 _PLACES = {"hydra.run.dir": "--run-id=NAME", "output_dir": "--results-dir=FOLDER", "resume": "--resume"}
 """Options of ours that say where a run lies, and the flags that do so here."""
 _OF_PLACES = re.compile(r"env\.(backend|port)=")
 _OF_SCENES = re.compile(r"env\.(?!params\b)")
 """Lines that say where a run is trained: in a player or the Editor, and in a scene, which has no other."""
-"""Options of a run that a resumed one keeps."""
 
 
 def help_text() -> str:

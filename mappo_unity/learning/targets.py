@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict
-from torch import nn
+from torch import Tensor, nn
 
 from mappo_unity import keys
 from mappo_unity.config.schema import PPOConfig, ValueNormKind, ValueNormUpdate
@@ -49,11 +49,11 @@ def enter_targets(
     # Clipping is around what the critic said: PopArt rescales that with the statistics, nothing else does.
     by_minibatch = cfg.value_norm_update is ValueNormUpdate.minibatch
     rescaled = layers if cfg.normalize_values is ValueNormKind.popart else ()
-    said = [x if x is None else norm.normalize(x) for x in (values.value, values.baseline)]
+    said = _outputs(values, norm)
     if not by_minibatch:
         move_statistics(norm, gae.target[gae.known.squeeze(-1)], rescaled)
     if rescaled:
-        said = [x if x is None else norm.normalize(x) for x in (values.value, values.baseline)]
+        said = _outputs(values, norm)
 
     advantage = gae.advantage
     if values.baseline is not None:
@@ -66,6 +66,11 @@ def enter_targets(
     # where the statistics move with each minibatch, it normalises its targets itself
     rounds.set(keys.ADVANTAGE, advantage)
     rounds.set(keys.VALUE_TARGET, gae.target if by_minibatch else norm.normalize(gae.target))
-    for key, output in zip((keys.VALUE, BASELINE), said):
-        if output is not None:
-            rounds.set(key, output)
+    for key, output in said.items():
+        rounds.set(key, output)
+
+
+def _outputs(values: Values, norm: ValueNorm) -> dict[str, Tensor]:
+    """Return what the critic says of values in the rewards' scale, its baselines where it has them."""
+    baseline = {} if values.baseline is None else {BASELINE: norm.normalize(values.baseline)}
+    return {keys.VALUE: norm.normalize(values.value)} | baseline

@@ -20,11 +20,10 @@ from mappo_unity.config.options_file import read_yaml
 from mappo_unity.config.renamed import rename_keys
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
-from mappo_unity.runs.folder import CONFIG, OVERRIDES, VERSIONS, check_there, find_run, runs_below
+from mappo_unity.runs.folder import CONFIG, METRICS, OVERRIDES, VERSIONS, check_there, find_run, runs_below
 from mappo_unity.runs.json_record import read_json
 from mappo_unity.runs.metrics_csv import STEP, read_metrics
 
-METRICS = "metrics.csv"
 RESULT = "result.json"  # of a sweep's job
 _DEPTH = 4  # folders below the one that is named in which runs are looked for
 

@@ -23,6 +23,7 @@ from mappo_unity.config.schema import Config
 from mappo_unity.config.user_modules import folder_of
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.checkpoint_file import checkpoints_in, newest_good
 from mappo_unity.runs.json_record import read_json
 from mappo_unity.runs.lock import LOCK, locked
 from mappo_unity.runs.versions import read_versions
@@ -134,6 +135,17 @@ def restore_record(folder: Path, record: Record) -> None:
             write_atomically(folder / name, record.files[name])
         else:
             (folder / name).unlink(missing_ok=True)
+
+
+def checkpoint_of_job(folder: Path) -> Path | None:
+    """Return the checkpoint from which a job that is started again goes on.
+
+    A job that was ended before its first one begins anew: what it logged counts no more.
+    """
+    if checkpoints_in(folder):
+        return newest_good(folder)[0]
+    (folder / METRICS).unlink(missing_ok=True)
+    return None
 
 
 def find_run(path: Path, option: str) -> Path:

@@ -30,8 +30,7 @@ from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.runs.atomic import write_atomically
-from mappo_unity.runs.checkpoint_file import checkpoints_in, newest_good
-from mappo_unity.runs.folder import METRICS, NewFolder, create_folder, discard_folder, write_record
+from mappo_unity.runs.folder import NewFolder, checkpoint_of_job, create_folder, discard_folder, write_record
 from mappo_unity.runs.lock import locked
 from mappo_unity.runs.progress import job_of_sweep
 from mappo_unity.scenes.factory import check_factory
@@ -181,9 +180,7 @@ def _train(config: Config, folder: Path, result: JobResult) -> int | None:
         from mappo_unity.training.trainer import train
 
     # the folder was new: what lies there is of this job, which its scheduler has started again
-    checkpoint = newest_good(folder)[0] if checkpoints_in(folder) else None
-    if checkpoint is None:  # it ended before its first one: what it logged counts no more
-        (folder / METRICS).unlink(missing_ok=True)
+    checkpoint = checkpoint_of_job(folder)
     with job_of_sweep(result.job, in_process_of_its_own()):
         outcome = train(config, folder, checkpoint)
 

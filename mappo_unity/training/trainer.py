@@ -72,16 +72,12 @@ def train(
         resume_steps = state.agent_steps if resume_from is not None else None
         with RunLog(cfg.log, folder, cfg.max_steps, resume_steps, console) as log:
             # not before: until here something may be refused
-            begun = [f"run folder: {folder}"]
-            if resume_from is not None:
-                aside = set_aside_later(folder, resume_from, state.agent_steps)
-                begun = [f"resuming from {resume_from}", *aside]
+            begun = _begin_in(folder, resume_from, state.agent_steps)
             served = [] if address is None else [f"dashboard: {address}"]
             for note in [*begun, *served, *setup.notes, *state.notes, *started]:
                 log.message(note)
 
-            is_resumed = resume_from is not None
-            exports = RunExports(folder, log.message, is_resumed) if cfg.export_onnx else None
+            exports = RunExports(folder, log.message, resume_from is not None) if cfg.export_onnx else None
             saver = CheckpointSaver(cfg, folder, state, exports, resume_from)
             stop = StopSignals(log.message)
             specs = {name: behavior.spec for name, behavior in setup.env.behaviors.items()}
@@ -92,6 +88,13 @@ def train(
                 state.begin()
                 status = _iterate_and_save(cfg, batches, state, saver, log, watch, stop, after_iteration)
             return _outcome(status, state, saver, stop)
+
+
+def _begin_in(folder: Path, resume_from: Path | None, agent_steps: int) -> list[str]:
+    """Move what is in a resumed run's way aside; return lines about where the run begins."""
+    if resume_from is None:
+        return [f"run folder: {folder}"]
+    return [f"resuming from {resume_from}", *set_aside_later(folder, resume_from, agent_steps)]
 
 
 def _iterate_and_save(

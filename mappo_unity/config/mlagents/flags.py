@@ -76,12 +76,15 @@ def help_text() -> str:
     return _parser().format_help().rstrip()
 
 
+def before_env_args(arguments: list[str]) -> list[str]:
+    """Return the words of a command line that are not the player's."""
+    return arguments[: arguments.index(_ENV_ARGS)] if _ENV_ARGS in arguments else arguments
+
+
 def parse_flags(arguments: list[str]) -> Flags:
     """Read a command line; raise ConfigError."""
-    env_args: list[str] | None = None
-    if _ENV_ARGS in arguments:
-        at = arguments.index(_ENV_ARGS)
-        arguments, env_args = arguments[:at], arguments[at + 1 :]
+    words_of_player = arguments[len(before_env_args(arguments)) :]  # and the flag before them
+    arguments = before_env_args(arguments)
 
     known = vars(_parser().parse_intermixed_args(arguments))
     words = known.pop("words")
@@ -100,8 +103,8 @@ def parse_flags(arguments: list[str]) -> Flags:
             flags.warnings.append(_about(flag))
 
     flags.given = {key: value for key, value in known.items() if value is not None}
-    if env_args is not None:
-        flags.given["env_settings.env_args"] = env_args
+    if words_of_player:
+        flags.given["env_settings.env_args"] = words_of_player[1:]
     return flags
 
 

@@ -19,7 +19,7 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.policies.first_checks import check_environment
 from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.runs.json_record import record_to_resume
-from mappo_unity.training.search.space import Choices, Range, Space, read_space, to_line
+from mappo_unity.training.search.space import Space, read_space, to_line
 
 RECORD = "search.json"
 """What a search is, in its folder: a later call with the same goes on with it."""
@@ -110,7 +110,7 @@ def check_search(options: SearchConfig, lines: list[str], file: Path | None) -> 
         lines = [*lines, f"stop_at_return={options.goal:g}"]
 
     config = _check_corners(space, lines, file)
-    preset = {key: _as_written(entry, _value(config, key)) for key, entry in space.items()}
+    preset = {key: entry.written(_value(config, key)) for key, entry in space.items()}
     is_inside = all(entry.holds(preset[key]) for key, entry in space.items())
 
     plan = SearchPlan(
@@ -156,10 +156,6 @@ def _check_corners(space: Space, lines: list[str], file: Path | None) -> Config:
 
     check_environment(adopt_file_options(config, [*lines, *corner], file))
     return plain
-
-
-def _as_written(entry: Range | Choices, value: Any) -> Any:
-    return entry.written(value) if isinstance(entry, Choices) else value
 
 
 def _value(config: Config, key: str) -> Any:

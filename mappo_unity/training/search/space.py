@@ -40,6 +40,10 @@ class Range:
     log: bool
     whole: bool
 
+    def written(self, value: Any) -> Any:
+        """Return a value as a space has it: a number itself."""
+        return value
+
     def holds(self, value: Any) -> bool:
         """Return whether a value lies in the range."""
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)

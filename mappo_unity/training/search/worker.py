@@ -16,8 +16,7 @@ from mappo_unity.config.schema import Config, SearchObjective
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.runs.atomic import write_atomically
-from mappo_unity.runs.checkpoint_file import checkpoints_in, newest_good
-from mappo_unity.runs.folder import METRICS, write_record
+from mappo_unity.runs.folder import checkpoint_of_job, write_record
 from mappo_unity.runs.lock import locked
 from mappo_unity.scenes.factory import check_factory
 from mappo_unity.training.child_process import begin_child
@@ -125,9 +124,7 @@ def _train(run: Run, task: Task, marks: _Marks, job: JobResult) -> Outcome:
             config = _config(run, task)
             write_record(run.folder, config, run.lines)
             check_factory(config.env)
-            checkpoint = newest_good(run.folder)[0] if checkpoints_in(run.folder) else None
-            if checkpoint is None:  # killed before its first one: what it logged counts no more
-                (run.folder / METRICS).unlink(missing_ok=True)
+            checkpoint = checkpoint_of_job(run.folder)
             outcome = train(config, run.folder, checkpoint, marks, Console(quiet=True))
     finally:
         job.wall_s = round(time.monotonic() - start_s, 3)
