@@ -83,10 +83,10 @@ def before_env_args(arguments: list[str]) -> list[str]:
 
 def parse_flags(arguments: list[str]) -> Flags:
     """Read a command line; raise ConfigError."""
-    words_of_player = arguments[len(before_env_args(arguments)) :]  # and the flag before them
-    arguments = before_env_args(arguments)
+    own = before_env_args(arguments)
+    words_of_player = arguments[len(own) :]  # and the flag before them
 
-    known = vars(_parser().parse_intermixed_args(arguments))
+    known = vars(_parser().parse_intermixed_args(own))
     words = known.pop("words")
     if known.pop("env_args") is not None:
         raise ConfigError(f"{_ENV_ARGS} is written {_ENV_ARGS} WORD ... at the end of the line")
