@@ -110,6 +110,10 @@ STARTS = [
         dict.fromkeys(["Crew?team=1", "Crew"], BehaviorSpec([SENSOR], ACTION)),
         "behaviors 'Crew' and 'Crew.team=1' share the policy 'Crew': give each a side",
     ),
+    (
+        dict.fromkeys(["Red crew", "red_crew?team=1"], BehaviorSpec([SENSOR], ACTION)),
+        "behaviors 'Red crew' and 'red_crew' would share the file red_crew.onnx: give them names",
+    ),
     ({NAME: ACTION}, "'Crew.team=0': its spec is a ActionSpec; it must be a BehaviorSpec"),
     ({NAME: BehaviorSpec([], ACTION)}, "'Crew.team=0' has no observation"),
     ({NAME: BehaviorSpec([(3,)], ACTION)}, "observation_specs is .*; it must be a list of ObservationSpec"),

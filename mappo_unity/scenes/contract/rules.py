@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from mlagents_envs.base_env import ActionSpec, BehaviorSpec, ObservationSpec
 
+from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 
 MAX_SILENT_STEPS = 100_000  # BaseEnv steps in a row without a request before that is an error
@@ -71,6 +72,17 @@ def check_specs(specs: Any) -> None:
             raise EnvironmentDataError(
                 f"behaviors {name!r} and {side!r} share the policy {name!r}: give each a side of its own, "
                 f"{name}?team=0 and {name}?team=1"
+            )
+
+    # exported files and recordings have a policy's name, which some systems read without regard to case
+    policies = dict.fromkeys(keys.policy_name(name) for name in specs)
+    named: dict[str, str] = {}
+    for policy in policies:
+        other = named.setdefault(keys.file_stem(policy).casefold(), policy)
+        if other != policy:
+            raise EnvironmentDataError(
+                f"behaviors {other!r} and {policy!r} would share the file {keys.file_stem(policy)}.onnx: "
+                "give them names that differ in more than case, spaces and signs"
             )
 
 
