@@ -57,6 +57,7 @@ def reflect_soccer(scene):
 
 SIDES = "mirror.branches=[0,1,2,0,2,1,0,2,1]"
 SOCCER = ["env=SoccerTwos", "model.mirror.rays=[0,11,8,3,264,3,8,3]", f"model.{SIDES}"]
+WALKER = ["env=Walker", "model.mirror.use=true"]
 GOALIE = [
     "env=StrikersVsGoalie",
     "behaviors.Striker.model.mirror.rays=[0,11,7,3,231,3,7,3]",
@@ -67,7 +68,7 @@ GOALIE = [
 
 
 @pytest.mark.parametrize(
-    "lines, reflect", [(["env=Walker"], reflect_walker), (SOCCER, reflect_soccer), (GOALIE, reflect_soccer)]
+    "lines, reflect", [(WALKER, reflect_walker), (SOCCER, reflect_soccer), (GOALIE, reflect_soccer)]
 )
 def test_the_mirror_image_of_a_scene_plays_as_its_mirror_image(lines, reflect):
     """What agents see in two areas, one the other's image, under actions that are each other's image."""
@@ -267,7 +268,7 @@ def test_a_run_trains_resumes_and_is_what_others_begin_with(tmp_path, capsys):
 
 
 def test_what_a_preset_describes_can_be_left_aside():
-    config = compose_config(["env=Walker", "model.mirror.use=false", "model.memory=lstm"]).config
+    config = compose_config([*WALKER, "model.mirror.use=false", "model.memory=lstm"]).config
     assert config.model.mirror.swap and not config.model.mirror.is_used
     assert make_mirror(config.model.mirror, ObsLayout(243), ActionLayout(39, ())) is None
 
@@ -356,7 +357,7 @@ def test_what_is_no_mirror_image_is_refused(options, message):
             "flip_images=true has no effect: there are no images",
         ),
         (["env=Basic", BASIC, "model.memory=lstm"], "model.mirror needs model.memory=none, not lstm"),
-        (["env=Walker", "model.memory=gru"], "not known; model.mirror.use=false does without"),
+        ([*WALKER, "model.memory=gru"], "not known; model.mirror.use=false does without"),
         (["env=Basic", BASIC, "model.critic=poca"], "not poca: its baseline sees actions"),
         ([*SOCCER, "model.flatten_branches=true"], "needs model.flatten_branches=false, not true"),
     ],
