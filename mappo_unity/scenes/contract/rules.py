@@ -75,9 +75,8 @@ def check_specs(specs: Any) -> None:
             )
 
     # exported files and recordings have a policy's name, which some systems read without regard to case
-    policies = dict.fromkeys(keys.policy_name(name) for name in specs)
     named: dict[str, str] = {}
-    for policy in policies:
+    for policy in map(keys.policy_name, specs):
         other = named.setdefault(keys.file_stem(policy).casefold(), policy)
         if other != policy:
             raise EnvironmentDataError(
