@@ -35,6 +35,7 @@ MISTAKES = [
     ("check_export.py nowhere --run-policy nowhere.py", "run_policy.py is not at nowhere.py"),
     ("check_goalie.py nowhere", "nowhere does not exist"),
     ("check_mlagents_configs.py nowhere", "nowhere does not exist"),
+    ("check_walker.py --policy nowhere", "policy=nowhere does not exist"),
     ("check_warm_starts.py nowhere", "there is no .onnx file"),
     ("clone_demos.py nowhere", "does not exist"),
     ("compare_critics.py Nope", "Nope: critics are compared in"),
