@@ -110,7 +110,11 @@ class PPOConfig:
     weight_decay: float = 0.0
     """Weight decay of the optimizer."""
     gamma: float = 0.99
-    """Discount of a decision."""
+    """Discount of a decision at the start."""
+    gamma_schedule: Schedule = Schedule.constant
+    """How the discount moves to ppo.gamma_final over max_steps; that of rewards.extrinsic.gamma stays."""
+    gamma_final: float = 0.995
+    """Discount at the end of its schedule."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation."""
     advantage: AdvantageKind = AdvantageKind.gae
@@ -195,6 +199,7 @@ class PPOConfig:
         above("ppo.optimizer_eps", self.optimizer_eps, 0)
         at_least("ppo.weight_decay", self.weight_decay, 0)
         within("ppo.gamma", self.gamma, 0, 1)
+        within("ppo.gamma_final", self.gamma_final, 0, 1)
         within("ppo.gae_lambda", self.gae_lambda, 0, 1)
         at_least("ppo.time_horizon", self.time_horizon, 1)
         between("ppo.clip_epsilon", self.clip_epsilon, 0, 1)

@@ -14,8 +14,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from mappo_unity import keys
-from mappo_unity.config.schema import Config, ImageKind, IntrinsicConfig, PPOConfig, RewardsConfig
-from mappo_unity.learning.advantage import share_left
+from mappo_unity.config.schema import Config, ImageKind, IntrinsicConfig, PPOConfig, RewardsConfig, Schedule
+from mappo_unity.learning.advantage import scheduled, share_left
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.distributions import ActionLayout
@@ -143,16 +143,21 @@ class RewardStreams:
         self.intrinsic = list(intrinsic)
         self.names = [EXTRINSIC, *(stream.name for stream in intrinsic)]
         self.gammas = [ppo.gamma if own.gamma is None else own.gamma, *(s.cfg.gamma for s in intrinsic)]
+        self._moves_gamma = own.gamma is None and ppo.gamma_schedule is not Schedule.constant
         self._weights = [(keys.REWARD, own.strength * ppo.reward_weight)]
         self._weights += [(keys.GROUP_REWARD, own.strength * ppo.group_reward_weight)]
         self._decisions: Transitions | None = None  # of the batch in hand, until it is learnt
 
     def begin(self, progress: float) -> dict[str, float]:
-        """Set the strengths of the update that begins, after this share of the run; return them."""
-        strengths: dict[str, float] = {}
+        """Set discount and strengths of an update after this share of the run; return those that move."""
+        settings: dict[str, float] = {}
+        if self._moves_gamma:
+            ppo = self._ppo
+            self.gammas[0] = scheduled(ppo.gamma_schedule, ppo.gamma, ppo.gamma_final, progress)
+            settings["gamma"] = self.gammas[0]
         for stream in self.intrinsic:
-            strengths |= stream.begin(progress)
-        return strengths
+            settings |= stream.begin(progress)
+        return settings
 
     def rewards(
         self, rounds: TensorDict, following: TensorDictBase, view: DecisionView
