@@ -213,6 +213,7 @@ def test_a_warm_start_and_lessons_need_not_rise() -> None:
 def test_rewards_at_the_end_want_a_gamma_that_sees_them() -> None:
     late = {"rewards": FACTS["rewards"] | {"nonzero": 2000}}
     assert found(late, {"ppo.gamma": "0.5"}) == ["short sight"]  # 0.5 ** 10
+    assert found(late, {"ppo.gamma": "0.5"}, gamma=0.99) == []  # where its schedule has it by now
     assert found(late, {"ppo.gamma": "0.7"}) == []  # 0.7 ** 10 = 0.028
     long = {"episode_length_mean": 1000.0}
     assert found(late, {"ppo.gamma": "0.99"}, **long) == []  # 0.0066, but it learns

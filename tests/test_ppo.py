@@ -162,6 +162,21 @@ def test_schedules_reach_the_optimizer_and_the_loss():
     assert float(learner.loss.entropy_coeff) == pytest.approx(0.015)
 
 
+def test_a_discount_moves_over_the_run_and_reaches_the_targets():
+    def learnt(**options):
+        learner = make_learner(**options)
+        metrics = learner.learn(*whole(make_batch(learner)), 0.5)
+        return metrics.get("gamma"), metrics["explained_variance"]
+
+    moved, explained = learnt(gamma=0.5, gamma_schedule=Schedule.linear, gamma_final=0.9)
+    assert moved == pytest.approx(0.7)  # half way
+    assert (None, pytest.approx(explained)) == learnt(gamma=0.7)
+    assert (None, pytest.approx(explained)) != learnt(gamma=0.5, gamma_final=0.9)  # constant
+
+    with pytest.raises(ConfigError, match="ppo.gamma_final must be from 0 to 1"):
+        make_learner(gamma_final=1.1)
+
+
 def test_a_weight_of_entropy_below_0_takes_randomness_away():
     learner = make_learner(lr=1e-2, lr_schedule=Schedule.constant, entropy_coef_final=-1.0)
     batch = make_batch(learner)

@@ -258,6 +258,14 @@ def test_the_environments_rewards_have_a_strength_and_a_discount() -> None:
     cfg = RewardsConfig(extrinsic=ExtrinsicConfig(strength=2.0, gamma=0.5))
     streams = RewardStreams(PPOConfig(reward_weight=3.0, group_reward_weight=0.5), cfg)
     assert streams.gammas == [0.5]
+
+    # which no schedule of ppo.gamma moves
+    moving = PPOConfig(gamma=0.9, gamma_schedule=Schedule.linear, gamma_final=1.0)
+    still = RewardStreams(moving, cfg)
+    assert still.begin(1.0) == {} and still.gammas == [0.5]
+    moved = RewardStreams(moving)
+    assert moved.begin(0.5) == {"gamma": pytest.approx(0.95)} and moved.gammas == [pytest.approx(0.95)]
+
     ones = torch.ones(1, 1, 1)
     rounds = TensorDict({keys.REWARD: ones, keys.GROUP_REWARD: ones}, [1, 1])
     view = make_view(ones.bool(), ones[0].bool(), ones.bool())

@@ -154,7 +154,8 @@ def _horizon(evidence: Evidence, below: float) -> Iterator[Finding]:
     """Yield policies whose gamma, less than `below`, does not reach the ends at which rewards come."""
     length = evidence.column("episode_length_mean")
     for name, facts in evidence.survey.items():
-        rewards, gamma = facts["rewards"], evidence.number("ppo.gamma", name)
+        rewards, moved = facts["rewards"], evidence.column("gamma", name)  # where it has a schedule
+        gamma = float(moved[-1]) if len(moved) else evidence.number("ppo.gamma", name)
         is_late = rewards["nonzero"] and rewards["at_ends"] >= 0.9 * rewards["nonzero"]
         if not len(length) or not is_late or not gamma < below:
             continue
