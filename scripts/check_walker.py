@@ -10,6 +10,7 @@ What a fall takes away (the last decision's reward, for -1) is not counted.
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,8 +129,13 @@ def main() -> None:
 
 def first_of_each_area(outcomes: list[Outcome], count: int) -> list[Outcome]:
     """Return the first `count` outcomes of each area."""
-    areas = {outcome.area for outcome in outcomes}
-    return [o for area in areas for o in [each for each in outcomes if each.area == area][:count]]
+    kept: list[Outcome] = []
+    of_area: Counter[int] = Counter()
+    for outcome in outcomes:
+        of_area[outcome.area] += 1
+        if of_area[outcome.area] <= count:
+            kept.append(outcome)
+    return kept
 
 
 def report(outcomes: list[Outcome]) -> None:
