@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from play_scene import play_until
 from run_script import run_script
 
 from mappo_unity.policies.evaluate import open_policy
@@ -73,13 +74,7 @@ def main() -> None:
     torch.manual_seed(options.seed)  # a checkpoint's policy draws from it
     env = CountingDungeon(num_areas=options.num_areas, seed=options.seed)
     policy = open_policy(options.policy, deterministic=False, seed=options.seed, option="policy")
-    env.reset()
-    while len(env.outcomes) < options.episodes:
-        for name, spec in env.behavior_specs.items():
-            decisions, _ = env.get_steps(name)
-            if len(decisions):
-                env.set_actions(name, policy.act(name, decisions, spec))
-        env.step()
+    play_until(lambda: len(env.outcomes) >= options.episodes, env, policy)
     turn, speed, seconds, freed = map(np.array, zip(*env.outcomes, strict=True))
     print(f"{Path(options.policy).name}, seed {options.seed}: {freed.mean():.1%} of {len(freed)} areas freed")
     for number in range(4):

@@ -10,11 +10,11 @@ What a fall takes away (the last decision's reward, for -1) is not counted.
 from __future__ import annotations
 
 import argparse
-from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from play_scene import play_until
 from run_script import run_script
 
 from mappo_unity.policies.evaluate import open_policy
@@ -24,14 +24,13 @@ from mappo_unity.scenes.walker.scene import MAX_SPEED, Walker, forward
 
 SPEED_STEP = 1.0  # m/s
 TURN_STEP = 45.0  # degrees
-TICKS_A_DECISION = 5
+TICKS_A_DECISION = Walker.DECISION_PERIOD
 ENDS = np.array([part.ends for part in body.PARTS])
 
 
 class Outcome(NamedTuple):
     """How an episode of a figure went."""
 
-    area: int
     goal_speed: float
     """m/s."""
     turn: float
@@ -48,11 +47,11 @@ class Outcome(NamedTuple):
 
 
 class WatchedWalker(Walker):
-    """Note how every figure's episode went, in `outcomes`."""
+    """Note how every figure's episode went, in the `outcomes` of its area."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[list[Outcome]] = [[] for _ in range(self.num_areas)]
         self._turn, self._earned, self._way, self._targets = np.zeros((4, self.num_areas))
 
     def fixed_update(self) -> None:
@@ -77,9 +76,8 @@ class WatchedWalker(Walker):
                 continue
 
             hits = np.flatnonzero(self.touching[area] & ENDS)
-            self.outcomes.append(
+            self.outcomes[area].append(
                 Outcome(
-                    area=area,
                     goal_speed=self.goal_speed[area],
                     turn=self._turn[area],
                     decisions=ticks / TICKS_A_DECISION,
@@ -115,27 +113,8 @@ def main() -> None:
         options.policy, deterministic=options.deterministic, seed=options.seed, option="policy"
     )
 
-    env.reset()
-    played = np.zeros(options.num_areas, int)
-    while played.min() < options.episodes:
-        for name, spec in env.behavior_specs.items():
-            decisions, _ = env.get_steps(name)
-            if len(decisions):
-                env.set_actions(name, policy.act(name, decisions, spec))
-        env.step()
-        played = np.bincount([outcome.area for outcome in env.outcomes], minlength=options.num_areas)
-    report(first_of_each_area(env.outcomes, options.episodes))
-
-
-def first_of_each_area(outcomes: list[Outcome], count: int) -> list[Outcome]:
-    """Return the first `count` outcomes of each area."""
-    kept: list[Outcome] = []
-    of_area: Counter[int] = Counter()
-    for outcome in outcomes:
-        of_area[outcome.area] += 1
-        if of_area[outcome.area] <= count:
-            kept.append(outcome)
-    return kept
+    play_until(lambda: min(map(len, env.outcomes)) >= options.episodes, env, policy)
+    report([outcome for of_area in env.outcomes for outcome in of_area[: options.episodes]])
 
 
 def report(outcomes: list[Outcome]) -> None:
