@@ -25,7 +25,6 @@ from mappo_unity.scenes.walker.scene import MAX_SPEED, Walker, forward
 SPEED_STEP = 1.0  # m/s
 TURN_STEP = 45.0  # degrees
 TICKS_A_DECISION = Walker.DECISION_PERIOD
-ENDS = np.array([part.ends for part in body.PARTS])
 
 
 class Outcome(NamedTuple):
@@ -75,7 +74,7 @@ class WatchedWalker(Walker):
             if not ticks:
                 continue
 
-            hits = np.flatnonzero(self.touching[area] & ENDS)
+            hits = np.flatnonzero(self.touching[area] & body.ENDS)
             self.outcomes[area].append(
                 Outcome(
                     goal_speed=self.goal_speed[area],

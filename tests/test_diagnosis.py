@@ -215,6 +215,10 @@ def test_rewards_at_the_end_want_a_gamma_that_sees_them() -> None:
     assert found(late, {"ppo.gamma": "0.5"}) == ["short sight"]  # 0.5 ** 10
     assert found(late, {"ppo.gamma": "0.5"}, gamma=0.99) == []  # where its schedule has it by now
     assert found(late, {"ppo.gamma": "0.7"}) == []  # 0.7 ** 10 = 0.028
+    own = "rewards.extrinsic.gamma"  # where it is given, the environment's rewards have it
+    assert found(late, {"ppo.gamma": "0.5", own: "null"}) == ["short sight"]
+    assert found(late, {"ppo.gamma": "0.5", own: "0.99"}) == []
+    assert found(late, {"ppo.gamma": "0.99", own: "0.5"}) == ["short sight"]
     long = {"episode_length_mean": 1000.0}
     assert found(late, {"ppo.gamma": "0.99"}, **long) == []  # 0.0066, but it learns
     assert found(late, {"ppo.gamma": "0.99"}, return_mean=0.0, **long) == ["no rise", "short sight"]

@@ -154,8 +154,8 @@ def _horizon(evidence: Evidence, below: float) -> Iterator[Finding]:
     """Yield policies whose gamma, less than `below`, does not reach the ends at which rewards come."""
     length = evidence.column("episode_length_mean")
     for name, facts in evidence.survey.items():
-        rewards, moved = facts["rewards"], evidence.column("gamma", name)  # where it has a schedule
-        gamma = float(moved[-1]) if len(moved) else evidence.number("ppo.gamma", name)
+        rewards = facts["rewards"]
+        option, gamma = _discount(evidence, name)
         is_late = rewards["nonzero"] and rewards["at_ends"] >= 0.9 * rewards["nonzero"]
         if not len(length) or not is_late or not gamma < below:
             continue
@@ -166,10 +166,20 @@ def _horizon(evidence: Evidence, below: float) -> Iterator[Finding]:
         if worth < 0.01:
             yield Finding(
                 "short sight",
-                f"{name}: rewards come at the end, and ppo.gamma does not see so far",
+                f"{name}: rewards come at the end, and {option} does not see so far",
                 f"{amount(mean)} decisions an episode: half way the end is worth {worth:.2g} of itself",
-                f"ppo.gamma={1 - 2 / max(mean, 20):.3g} or more (now {gamma:g})",
+                f"{option}={1 - 2 / max(mean, 20):.3g} or more (now {gamma:g})",
             )
+
+
+def _discount(evidence: Evidence, name: str) -> tuple[str, float]:
+    """Return the option that discounts the environment's rewards, and where it stands."""
+    own = evidence.number("rewards.extrinsic.gamma", name)
+    if not math.isnan(own):
+        return "rewards.extrinsic.gamma", own
+
+    moved = evidence.column("gamma", name)  # where it has a schedule
+    return "ppo.gamma", float(moved[-1]) if len(moved) else evidence.number("ppo.gamma", name)
 
 
 def _of(name: str | None) -> str:

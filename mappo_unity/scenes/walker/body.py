@@ -76,6 +76,9 @@ PARTS = (
 )
 """Parts in the order of the observation."""
 
+ENDS = np.array([part.ends for part in PARTS])
+"""Whether a part's touch of the ground ends the episode, bool ``[16]``."""
+
 _TORSO = ((1, 0, 0), (0, 0, -1), (0, 1, 0))
 _LEG = ((-1, 0, 0), (0, 0, -1), (0, -1, 0))
 _FOOT = ((1, 0, 0), (0, 1, 0), (0, 0, 1))

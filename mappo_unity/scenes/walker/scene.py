@@ -27,7 +27,6 @@ _NAMES = [part.name for part in body.PARTS]
 _JOINTED = np.array([_NAMES.index(name) for name in body.JOINTS])
 _PARENTS = np.array([_NAMES.index(body.PARTS[i].parent) for i in _JOINTED])
 _HEAD = _NAMES.index("head")
-_ENDS = np.array([part.ends for part in body.PARTS])
 _NUM_COLUMNS = 15  # of a part: contact 1, velocity 3, spin 3, position 3, rotation 4, strength 1
 _COLUMNS = np.array(
     [
@@ -158,7 +157,7 @@ class Walker(Scene):
         self.grounded = (self.grounded | begun) & touching
         self.touching = touching
 
-        fallen = (begun & _ENDS).sum(axis=1)
+        fallen = (begun & body.ENDS).sum(axis=1)
         for hits in (1, 2):  # the second hit of a tick sets -1 again, which the next record brings
             again = np.flatnonzero(fallen >= hits)
             if again.size:
