@@ -26,6 +26,7 @@ from mappo_unity.learning.networks.actor_critic import make_actor, make_critic
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.ppo import PolicyLearner
+from mappo_unity.learning.rewards.streams import RewardStreams
 from mappo_unity.learning.value_norm import move_statistics
 
 T, G, A, OBS = 12, 5, 2, 3
@@ -175,6 +176,31 @@ def test_a_discount_moves_over_the_run_and_reaches_the_targets():
 
     with pytest.raises(ConfigError, match="ppo.gamma_final must be from 0 to 1"):
         make_learner(gamma_final=1.1)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "expected"),
+    [
+        (0.0, 0.5, [0.5, 0.7, 0.9, 0.9, 0.9]),
+        (0.5, 1.0, [0.5, 0.5, 0.5, 0.7, 0.9]),
+        (0.75, 0.75, [0.5, 0.5, 0.5, 0.9, 0.9]),  # at once
+        (1.0, 1.0, [0.5, 0.5, 0.5, 0.5, 0.9]),
+        (0.0, 0.0, [0.9] * 5),
+    ],
+)
+def test_a_discount_moves_within_a_part_of_the_run(first: float, last: float, expected: list[float]):
+    cfg = PPOConfig(
+        gamma=0.5, gamma_schedule=Schedule.linear, gamma_final=0.9, gamma_from=first, gamma_until=last
+    )
+    streams = RewardStreams(cfg)
+    assert [streams.begin(p)["gamma"] for p in (0, 0.25, 0.5, 0.75, 1)] == pytest.approx(expected)
+
+
+def test_the_part_in_which_a_discount_moves_lies_in_the_run():
+    with pytest.raises(ConfigError, match="ppo.gamma_from must be from 0 to 1"):
+        make_learner(gamma_from=-0.1)
+    with pytest.raises(ConfigError, match="ppo.gamma_until must be from ppo.gamma_from=0.4 to 1"):
+        make_learner(gamma_from=0.4, gamma_until=0.3)
 
 
 def test_a_weight_of_entropy_below_0_takes_randomness_away():

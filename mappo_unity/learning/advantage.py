@@ -211,6 +211,18 @@ def scheduled(schedule: Schedule, start: float, final: float, progress: float) -
     return start + (final - start) * progress
 
 
+def part_over(progress: float, first: float, last: float) -> float:
+    """Return which share, 0 to 1, of a part of a run is over; one without length is over from its place on.
+
+    Args:
+        progress: share of the run that is over, 0 to 1.
+        first, last: shares of the run between which the part lies.
+    """
+    if progress >= last:
+        return 1.0
+    return 0.0 if progress <= first else (progress - first) / (last - first)
+
+
 def share_left(steps: int, max_steps: int, progress: float) -> float:
     """Return what is left of a strength that falls to 0 over the first `steps` decisions; 0 steps: all.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Optional
 
-from mappo_unity.config.schema.checks import above, at_least, between, within
+from mappo_unity.config.schema.checks import above, at_least, between, rule, within
 from mappo_unity.errors import ConfigError
 
 
@@ -115,6 +115,10 @@ class PPOConfig:
     """How the discount moves to ppo.gamma_final over max_steps; that of rewards.extrinsic.gamma stays."""
     gamma_final: float = 0.995
     """Discount at the end of its schedule."""
+    gamma_from: float = 0.0
+    """Share of max_steps after which the discount begins to move."""
+    gamma_until: float = 1.0
+    """Share of max_steps after which the discount is ppo.gamma_final; as ppo.gamma_from, it moves at once."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation."""
     advantage: AdvantageKind = AdvantageKind.gae
@@ -200,6 +204,9 @@ class PPOConfig:
         at_least("ppo.weight_decay", self.weight_decay, 0)
         within("ppo.gamma", self.gamma, 0, 1)
         within("ppo.gamma_final", self.gamma_final, 0, 1)
+        within("ppo.gamma_from", self.gamma_from, 0, 1)
+        until, begins = self.gamma_until, self.gamma_from
+        rule("ppo.gamma_until", until, begins <= until <= 1, f"must be from ppo.gamma_from={begins} to 1")
         within("ppo.gae_lambda", self.gae_lambda, 0, 1)
         at_least("ppo.time_horizon", self.time_horizon, 1)
         between("ppo.clip_epsilon", self.clip_epsilon, 0, 1)

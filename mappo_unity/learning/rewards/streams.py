@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mappo_unity import keys
 from mappo_unity.config.schema import Config, ImageKind, IntrinsicConfig, PPOConfig, RewardsConfig, Schedule
-from mappo_unity.learning.advantage import scheduled, share_left
+from mappo_unity.learning.advantage import part_over, scheduled, share_left
 from mappo_unity.learning.decisions import DecisionView
 from mappo_unity.learning.imitation.expert import Expert
 from mappo_unity.learning.networks.distributions import ActionLayout
@@ -153,7 +153,8 @@ class RewardStreams:
         settings: dict[str, float] = {}
         if self._moves_gamma:
             ppo = self._ppo
-            self.gammas[0] = scheduled(ppo.gamma_schedule, ppo.gamma, ppo.gamma_final, progress)
+            over = part_over(progress, ppo.gamma_from, ppo.gamma_until)
+            self.gammas[0] = scheduled(ppo.gamma_schedule, ppo.gamma, ppo.gamma_final, over)
             settings["gamma"] = self.gammas[0]
         for stream in self.intrinsic:
             settings |= stream.begin(progress)
