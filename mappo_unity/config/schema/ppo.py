@@ -118,7 +118,7 @@ class PPOConfig:
     gamma_from: float = 0.0
     """Share of max_steps after which the discount begins to move."""
     gamma_until: float = 1.0
-    """Share of max_steps after which the discount is ppo.gamma_final; as ppo.gamma_from, it moves at once."""
+    """Share after which it is ppo.gamma_final; the same as ppo.gamma_from: it moves at once."""
     gae_lambda: float = 0.95
     """Lambda of generalised advantage estimation."""
     advantage: AdvantageKind = AdvantageKind.gae
