@@ -34,6 +34,8 @@ MISTAKES = [
     ("check_dungeon.py --policy nowhere", "policy=nowhere does not exist"),
     ("check_export.py nowhere --run-policy nowhere.py", "run_policy.py is not at nowhere.py"),
     ("check_goalie.py nowhere", "nowhere does not exist"),
+    ("check_gradient.py --run nowhere", "run=nowhere does not exist"),
+    ("check_gradient.py --run nowhere --decisions 9", "--decisions 9 must be at least four batches of 2560"),
     ("check_mlagents_configs.py nowhere", "nowhere does not exist"),
     ("check_walker.py --policy nowhere", "policy=nowhere does not exist"),
     ("check_warm_starts.py nowhere", "there is no .onnx file"),
