@@ -31,9 +31,11 @@ from torch import Tensor
 
 from mappo_unity import keys
 from mappo_unity.errors import ConfigError
+from mappo_unity.learning.advantage import explained_variance
 from mappo_unity.learning.networks.actor_critic import make_critic
-from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionDistribution
+from mappo_unity.learning.networks.distributions import ActionDistribution
 from mappo_unity.learning.networks.encoders import ObsLayout
+from mappo_unity.learning.transitions import env_actions
 from mappo_unity.learning.value_norm import ValueNorm, by_stream
 from mappo_unity.policies.policy import actor_of, model_from_saved
 from mappo_unity.policies.policy_files import check_resumable, choose_checkpoint
@@ -50,8 +52,8 @@ class Learner:
     def __init__(self, path: Path) -> None:
         state = checkpoint.load(path)
         self.env_name = str(state["env_name"])
-        self.name, *others = state["layout"]
-        layout, model = state["layout"][self.name], model_from_saved(state["model"][self.name])
+        name, *others = state["layout"]
+        layout, model = state["layout"][name], model_from_saved(state["model"][name])
         sensors = layout["sensors"]
         is_plain = not others and layout["team_size"] == 1 and model.memory.value == "none"
         if not is_plain or layout["branches"] or any(len(shape) > 1 for shape in sensors):
@@ -60,8 +62,8 @@ class Learner:
                 "continuously and have no memory"
             )
 
-        self.actor = actor_of(state, self.name)
-        saved = state["learners"][self.name]
+        self.actor = actor_of(state, name)
+        saved = state["learners"][name]
         streams = len(by_stream(saved["value_norm"])["mean"])
         self.critic = make_critic(ObsLayout.from_shapes(sensors), 1, model, self.actor.layout, streams)
         self.critic.load_state_dict(saved["critic"])
@@ -134,8 +136,8 @@ def play(learner: Learner, num_areas: int, decisions: int, seed: int) -> list[Ep
                 episode.obs.append(obs[row])
                 episode.actions.append(actions[row])
                 episode.values.append(float(values[row]))
-            limited = actions.clamp(-CONTINUOUS_LIMIT, CONTINUOUS_LIMIT) / CONTINUOUS_LIMIT
-            env.set_actions(behavior, ActionTuple(continuous=limited.numpy()))
+            played = env_actions(actions, learner.actor.layout)
+            env.set_actions(behavior, ActionTuple(continuous=played.numpy()))
             count += len(asking)
         env.step()
 
@@ -154,11 +156,6 @@ def discounted(steps: np.ndarray, decay: float, last: float = 0.0) -> np.ndarray
     return sums
 
 
-def explained(values: Tensor, returns: Tensor) -> float:
-    """Return the share of the returns' variance that values explain."""
-    return float(1 - (returns - values).var() / returns.var())
-
-
 def show_critic(learner: Learner, episodes: list[Episode], gamma: float) -> None:
     """Print what the critic explains, and what it would after more epochs on the same policy's episodes."""
     obs = [torch.stack(episode.obs) for episode in episodes]
@@ -173,7 +170,10 @@ def show_critic(learner: Learner, episodes: list[Episode], gamma: float) -> None
         for is_held in (True, False)
     )
 
-    print(f"critic, explained variance as trained: {explained(learner.values(held[0]), held[1]):.3f}")
+    every = torch.ones_like(held[1], dtype=torch.bool)
+    value = explained_variance(learner.values(held[0]), held[1], every)
+    print(f"critic, explained variance as trained: {value:.3f}")
+
     critic = copy.deepcopy(learner.critic.module).train()
     optimizer = torch.optim.Adam(critic.parameters(), lr=FIT_RATE)
     targets = learner.norm.normalize(known[1].unsqueeze(-1))
@@ -183,7 +183,7 @@ def show_critic(learner: Learner, episodes: list[Episode], gamma: float) -> None
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-        value = explained(learner.values(held[0], critic), held[1])
+        value = explained_variance(learner.values(held[0], critic), held[1], every)
         print(f"after {epoch} more epochs on {len(targets):,} decisions of this policy: {value:.3f}")
 
 
