@@ -2,7 +2,7 @@
 """Count the areas of DungeonEscape that a policy frees: over all, by quarter turn, and by the dragon's speed.
 
     scripts/check_dungeon.py --policy DungeonEscape.onnx [--episodes 800] [--num-areas 64] [--seed 0]
-    scripts/check_dungeon.py --policy random
+    scripts/check_dungeon.py --policy random [--sight]
 
 An episode of an area ends when the door is unlocked (freed), the dragon or the last player reaches the
 portal, or at the time limit. docs/scenes/DungeonEscape.md has the figures of Unity's policy.
@@ -21,8 +21,9 @@ from run_script import run_script
 
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.scenes.core.ground import TICK_S
-from mappo_unity.scenes.dungeon_escape.layout import DRAGON, DRAGON_START_YAW
+from mappo_unity.scenes.dungeon_escape.layout import DRAGON, DRAGON_START_YAW, NUM_AGENTS
 from mappo_unity.scenes.dungeon_escape.scene import DungeonEscape
+from mappo_unity.scenes.dungeon_escape.sight import DRAGON_TAG, EYES, KEY_TAG
 
 SPEEDS, SPEED_STEP = (1, 3, 5), 2  # m/s
 
@@ -36,6 +37,10 @@ class Outcome(NamedTuple):
     """Of the dragon, m/s."""
     seconds: float
     freed: bool
+    looks: int
+    """Observations of players while the dragon lives."""
+    sightings: int
+    """Those that have it, or the key before it, on a ray."""
 
 
 class CountingDungeon(DungeonEscape):
@@ -46,6 +51,17 @@ class CountingDungeon(DungeonEscape):
         self.outcomes: list[Outcome] = []
         self._turn = np.zeros(self.num_areas, int)
         self._freed = np.zeros(self.num_areas, bool)
+        self._looks, self._sightings = np.zeros((2, self.num_areas), int)
+
+    def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
+        sensors = super().observe(behavior, slots)
+        rays = sensors[1].reshape(len(slots), EYES.num_rays, -1)
+        sees = (rays[:, :, [DRAGON_TAG, KEY_TAG]] > 0).any(axis=(1, 2))
+        areas = slots // NUM_AGENTS
+        lives = self.room.present[areas, DRAGON]
+        np.add.at(self._looks, areas, lives)
+        np.add.at(self._sightings, areas, lives & sees)
+        return sensors
 
     def _unlock(self, areas: np.ndarray) -> None:
         self._freed[areas] = True
@@ -54,8 +70,10 @@ class CountingDungeon(DungeonEscape):
     def _reset_areas(self, areas: np.ndarray) -> None:
         if self.started:
             parts = self._turn, self.room.dragon_speed, self.timer * TICK_S, self._freed
+            parts += self._looks, self._sightings
             self.outcomes += map(Outcome, *(part[areas].tolist() for part in parts))
         self._freed[areas] = False
+        self._looks[areas] = self._sightings[areas] = 0
         super()._reset_areas(areas)
         yaw = self.room.thing_yaw[areas, DRAGON]
         self._turn[areas] = np.abs(yaw[:, None] - DRAGON_START_YAW).argmin(axis=1)
@@ -70,12 +88,13 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=800, help="of areas, at least")
     parser.add_argument("--num-areas", type=int, default=64)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--sight", action="store_true", help="also how often players see the fastest dragons")
     options = parser.parse_args()
     torch.manual_seed(options.seed)  # a checkpoint's policy draws from it
     env = CountingDungeon(num_areas=options.num_areas, seed=options.seed)
     policy = open_policy(options.policy, deterministic=False, seed=options.seed, option="policy")
     play_until(lambda: len(env.outcomes) >= options.episodes, env, policy)
-    turn, speed, seconds, freed = map(np.array, zip(*env.outcomes, strict=True))
+    turn, speed, seconds, freed, looks, sightings = map(np.array, zip(*env.outcomes, strict=True))
     print(f"{Path(options.policy).name}, seed {options.seed}: {freed.mean():.1%} of {len(freed)} areas freed")
     for number in range(4):
         of_turn = freed[turn == number]
@@ -88,6 +107,13 @@ def main() -> None:
             share, lasting = (values[rows].mean() if rows.any() else np.nan for values in (freed, seconds))
             speeds = f"{slowest} to {slowest + SPEED_STEP} m/s"
             print(f"  {way} way, dragon at {speeds}: {share:.3f} of {rows.sum()}, {lasting:.1f} s each")
+
+    if not options.sight:
+        return
+    fastest = (turn >= 2) & (speed >= SPEEDS[-1])
+    for outcome, rows in (("freed", fastest & freed), ("lost", fastest & ~freed)):
+        seen = sightings[rows].sum() / max(looks[rows].sum(), 1)
+        print(f"  short way, fastest dragons, {outcome}: seen in {seen:.2f} of {looks[rows].sum()} looks")
 
 
 if __name__ == "__main__":

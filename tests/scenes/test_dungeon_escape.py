@@ -423,6 +423,10 @@ def test_the_script_counts_freed_areas() -> None:
     command = [sys.executable, str(script), "--policy", "random", "--episodes", "40", "--num-areas", "16"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+    with_sight = subprocess.run([*command, "--sight"], capture_output=True, text=True, timeout=120)
+    *same, freed, lost = with_sight.stdout.splitlines()
+    assert same == done.stdout.splitlines()
+    assert ", freed: seen in 0." in freed and ", lost: seen in 0." in lost
     counts = [int(line.rpartition(" of ")[2].split(",")[0].split()[0]) for line in done.stdout.splitlines()]
     total, turns, speeds = counts[0], counts[1:5], counts[5:]
     assert total >= 40 and sum(turns) == sum(speeds) == total and len(speeds) == 6
