@@ -69,8 +69,8 @@ class CountingDungeon(DungeonEscape):
 
     def _reset_areas(self, areas: np.ndarray) -> None:
         if self.started:
-            parts = self._turn, self.room.dragon_speed, self.timer * TICK_S, self._freed
-            parts += self._looks, self._sightings
+            course = self._turn, self.room.dragon_speed, self.timer * TICK_S
+            parts = *course, self._freed, self._looks, self._sightings
             self.outcomes += map(Outcome, *(part[areas].tolist() for part in parts))
         self._freed[areas] = False
         self._looks[areas] = self._sightings[areas] = 0
