@@ -67,6 +67,7 @@ def behavior_config(cfg: Config, policy: str) -> BehaviorConfig:
     out = BehaviorConfig(*(_merged(getattr(cfg, s), own.get(s), f"{where}.{s}") for s in sections))
     if not is_frozen(cfg, policy):
         _check_teachers(out, policy)
+        _check_members(out, policy)
     return out
 
 
@@ -94,6 +95,14 @@ def _check_form(own: Any, where: str) -> None:
         raise ConfigError(
             f"{where}.bc.only={show_value(own['bc']['only'])} has no effect: the environment is played for "
             "all behaviors or for none; give bc.only=true"
+        )
+
+
+def _check_members(out: BehaviorConfig, policy: str) -> None:
+    if out.ppo.shuffle_members and not out.model.share_parameters:
+        raise ConfigError(
+            f"ppo.shuffle_members=true of {policy} does not go with model.share_parameters=false, where each "
+            "member's network learns from that member alone; give ppo.shuffle_members=false"
         )
 
 

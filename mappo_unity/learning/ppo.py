@@ -16,24 +16,16 @@ from torchrl.data import ReplayBuffer
 
 from mappo_unity import keys
 from mappo_unity.config.schema import (
-    AdvantageKind,
     ObsNormUpdate,
     PPOConfig,
     RatioKind,
     ValueNormKind,
     ValueNormUpdate,
 )
-from mappo_unity.learning.advantage import (
-    approximate_kl,
-    estimate_streams,
-    last_mean,
-    make_view,
-    value_metrics,
-)
+from mappo_unity.learning.advantage import approximate_kl, last_mean, make_view, value_metrics
 from mappo_unity.learning.carried import VALUED, CarriedRounds, has_value
 from mappo_unity.learning.imitation.cloning import Cloning
 from mappo_unity.learning.loss import ACTOR_LEARNS, MaskedClipPPOLoss, move_with_minibatch
-from mappo_unity.learning.minibatches import make_buffer
 from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
 from mappo_unity.learning.networks.encoders import channels_first, running_norms, update_norms
 from mappo_unity.learning.networks.poca import PocaCritic
@@ -46,11 +38,11 @@ from mappo_unity.learning.optimizer import (
     load_optimizer,
     make_optimizer,
 )
-from mappo_unity.learning.proximal import enter_proximal, needs_proximal, stale_kl, truncated_ratio
+from mappo_unity.learning.proximal import enter_proximal, needs_proximal, stale_kl
 from mappo_unity.learning.reduction import ALONE, Reduction, check_reduced
 from mappo_unity.learning.rewards.streams import RewardStreams
 from mappo_unity.learning.rows import make_rows
-from mappo_unity.learning.targets import enter_masks, enter_targets
+from mappo_unity.learning.targets import PreparedBatch, enter_masks, enter_outputs, enter_targets
 from mappo_unity.learning.value_norm import ValueNorm, by_stream
 from mappo_unity.learning.value_reader import ValueReader
 
@@ -84,7 +76,7 @@ class PolicyLearner:
         self.params = [*actor.parameters(), *critic.parameters()]
         is_normalized = cfg.normalize_values is not ValueNormKind.none
         self.value_norm = ValueNorm(cfg.value_norm_beta, is_normalized, len(self.rewards.names))
-        self.reader = ValueReader(critic, self.value_norm)
+        self.reader = ValueReader(critic, self.value_norm, cfg.shuffle_members)
 
         inputs = [str(key) for net in (actor, critic) for key in net.in_keys]
         written = [keys.ACTION, keys.LOG_PROB] + [keys.LOG_PROBS] * actor.keeps_components
@@ -94,6 +86,7 @@ class PolicyLearner:
         self.carried = CarriedRounds(read, self.has_baseline, channels_first(critic))
         self.rows = make_rows(self.row_keys, critic, cfg)
 
+        self.prepared: PreparedBatch | None = None  # while it is learnt, with ppo.recompute_advantages
         self.value_layers = value_layers(critic)  # which PopArt rescales
         self.bounded = [m for m in actor.modules() if isinstance(m, Actor)]
         self.norms = [*running_norms(actor), *running_norms(critic)]
@@ -132,6 +125,7 @@ class PolicyLearner:
             buffer, metrics = self.prepare(batch, following)
             metrics |= self.update(buffer) if buffer is not None else {}
             metrics |= self.rewards.learn()
+            self.prepared = None
         if self.cloning is not None:
             metrics |= self.cloning.learn(int(batch.get(keys.ACTING).sum()), settings["lr"], progress)
         if not self.round_norms:
@@ -159,35 +153,38 @@ class PolicyLearner:
         if needs_proximal(self.cfg):
             enter_proximal(rounds, view, self.rows, self.loss)
             metrics["stale_kl"] = stale_kl(rounds, self.reduction)
-        gae = estimate_streams(
-            view,
-            rewards,
-            values.value,
-            values.end,
-            values.final,
-            rounds.get(keys.TRUNCATED),
-            gammas=self.rewards.gammas,
-            gae_lambda=self.cfg.gae_lambda,
-            horizon=self.cfg.time_horizon,
-            rho_T=truncated_ratio(rounds) if self.cfg.advantage is AdvantageKind.vtrace else None,
-        )
+        prepared = PreparedBatch(rounds, following, view, rewards)
+        self.prepared = prepared if self.cfg.recompute_advantages else None  # images would fill the memory
+        gae = prepared.estimate(values, self.rewards.gammas, self.cfg)
         self.reader.keep(values, rounds.get(VALUED) & ~gae.known)
 
         learns = rounds.get(ACTOR_LEARNS)
         metrics |= value_metrics(self.rewards.names, values.value, gae.target, learns, self.reduction)
-        enter_targets(rounds, values, gae, self.value_norm, self.value_layers, self.cfg, self.reduction)
-        rows, decisions = self.rows.of(rounds, view)
-        # where one of several learners has no decision, all of them wait
-        if not self.reduction.least(int(decisions.sum())):
-            return None, metrics
-        return make_buffer(rows, decisions, self.cfg, self.reduction), metrics
+        enter_outputs(rounds, values, gae, self.value_norm, self.value_layers, self.cfg)
+        enter_targets(rounds, values, gae, self.value_norm, self.cfg, self.reduction)
+        return prepared.buffer(self.rows, self.cfg, self.reduction), metrics
+
+    @torch.no_grad()
+    def prepare_again(self) -> ReplayBuffer | None:
+        """Return what `prepare` returned last, with advantages and targets by the critic as it is now.
+
+        What the policy and a clipped value are compared with stays, and so do the statistics of returns.
+        """
+        batch = self.prepared
+        assert batch is not None, "ppo.recompute_advantages"
+        values = self.reader.read_again(batch.rounds, batch.following)
+        gae = batch.estimate(values, self.rewards.gammas, self.cfg)
+        enter_targets(batch.rounds, values, gae, self.value_norm, self.cfg, self.reduction)
+        return batch.buffer(self.rows, self.cfg, self.reduction)
 
     def update(self, buffer: ReplayBuffer) -> dict[str, float]:
         """Run the epochs; take everything back if a number is not finite or the KL explodes."""
         before = cloned(self._trainable_state())
         sums: dict[str, Tensor] = {}
         steps, kl_epoch, stopped = 0, 0.0, False
-        for _ in range(self.cfg.epochs):
+        for epoch in range(self.cfg.epochs):
+            if epoch and self.cfg.recompute_advantages:
+                buffer = self.prepare_again()
             kls = []
             for minibatch in buffer:
                 minibatch = self.rows.take(minibatch)

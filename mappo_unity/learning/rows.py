@@ -30,10 +30,11 @@ class TeamRows:
 
     Args:
         row_keys: entries that the networks read or wrote.
+        shuffles: take the members of each minibatch in an order of its own.
     """
 
-    def __init__(self, row_keys: list[str]) -> None:
-        self._keys = row_keys
+    def __init__(self, row_keys: list[str], shuffles: bool = False) -> None:
+        self._keys, self._shuffles = row_keys, shuffles
 
     def of(self, rounds: TensorDict, view: DecisionView) -> tuple[TensorDictBase, Tensor]:
         """Return the rows, and how many decisions each holds, int64 ``[R]``."""
@@ -59,7 +60,10 @@ class TeamRows:
 
     def take(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return what the loss reads."""
-        return minibatch
+        if not self._shuffles:
+            return minibatch
+        order = torch.randperm(minibatch.shape[-1])
+        return minibatch[..., order.to(minibatch.get(keys.ADVANTAGE).device)]
 
 
 class SequenceRows:
@@ -69,13 +73,13 @@ class SequenceRows:
         row_keys: entries that the networks read or wrote.
         critic_keys: those that the critic reads.
         critic: the critic.
-        cfg: `sequence_length`.
+        cfg: `sequence_length`, `shuffle_members`.
     """
 
     def __init__(
         self, row_keys: list[str], critic_keys: list[str], critic: RecurrentCritic, cfg: PPOConfig
     ) -> None:
-        self._critic, self._length = critic, cfg.sequence_length
+        self._critic, self._length, self._shuffles = critic, cfg.sequence_length, cfg.shuffle_members
         self._critic_keys = critic_keys
         self._keys = [key for key in row_keys if key not in (keys.MEMORY, keys.PRESENT, keys.DEPARTED)]
         self._rounds: dict[str, Tensor] = {}  # [T, G, A, ...] of all sides
@@ -129,10 +133,16 @@ class SequenceRows:
         for key in (keys.MEMORY, *self._critic.state_names):
             out[key] = self._rounds[key][begin, team, member]
 
-        sees_team = self._critic.sees_team
-        of_critic = {k: self._team(k, minibatch) if sees_team else out[k] for k in self._critic_keys}
-        if self._critic.has_baseline:
-            of_critic[keys.ACTION] = self._team(keys.ACTION, minibatch)
+        seen = list(self._critic_keys) + [keys.ACTION] * self._critic.has_baseline
+        if not self._critic.sees_team:
+            of_critic = {key: out[key] for key in seen}
+        elif self._shuffles:
+            team_size = self._rounds[ACTOR_LEARNS].shape[-2]
+            order = torch.rand(len(member), team_size).argsort(-1).to(member.device)
+            of_critic = {key: self._team(key, minibatch, order) for key in seen}
+            member = order.argsort(-1)[torch.arange(len(member), device=member.device), member]
+        else:
+            of_critic = {key: self._team(key, minibatch) for key in seen}
         out |= {TEAM: TensorDict(of_critic, minibatch.batch_size), MEMBER: member}
         return TensorDict(out, minibatch.batch_size)
 
@@ -140,12 +150,16 @@ class SequenceRows:
         team, member = at.get(_TEAM_ROW).unsqueeze(-1), at.get(MEMBER).unsqueeze(-1)
         return self._rounds[key][at.get(_ROUND), team, member]
 
-    def _team(self, key: str, at: TensorDictBase) -> Tensor:
-        return self._rounds[key][at.get(_ROUND), at.get(_TEAM_ROW).unsqueeze(-1)]
+    def _team(self, key: str, at: TensorDictBase, order: Tensor | None = None) -> Tensor:
+        """Return an entry ``[B, L, A, *]`` of whole teams, members in these orders ``[B, A]``."""
+        team = at.get(_TEAM_ROW).unsqueeze(-1)
+        if order is None:
+            return self._rounds[key][at.get(_ROUND), team]
+        return self._rounds[key][at.get(_ROUND).unsqueeze(-1), team.unsqueeze(-1), order.unsqueeze(1)]
 
 
 def make_rows(row_keys: list[str], critic: TensorDictModule, cfg: PPOConfig) -> TeamRows | SequenceRows:
     """Return what an update learns on: sequences where the critic (and so the actor) has a memory."""
     if not isinstance(critic.module, RecurrentCritic):
-        return TeamRows(row_keys)
+        return TeamRows(row_keys, cfg.shuffle_members)
     return SequenceRows(row_keys, [str(key) for key in critic.in_keys], critic.module, cfg)

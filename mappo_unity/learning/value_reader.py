@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mappo_unity import keys
 from mappo_unity.learning.carried import VALUED
+from mappo_unity.learning.networks.critics import CentralCritic
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import BASELINE_STATE, VALUE_STATE, RecurrentCritic
 from mappo_unity.learning.value_norm import ValueNorm
@@ -36,12 +37,18 @@ class ValueReader:
     Args:
         critic: see `learning.networks.actor_critic.make_critic`.
         norm: turns its output into the reward's scale.
+        shuffles: it learns members in any order (`ppo.shuffle_members`): each value of a central critic
+            without a memory is the mean over as many orders as there are members, each of which is once in
+            each place.
     """
 
-    def __init__(self, critic: TensorDictModule, norm: ValueNorm) -> None:
+    def __init__(self, critic: TensorDictModule, norm: ValueNorm, shuffles: bool = False) -> None:
         self.critic, self.norm = critic.module, norm
+        central = any(isinstance(part, CentralCritic) for part in critic.modules())
+        self._averages = shuffles and central
         self.keys = [str(key) for key in critic.in_keys]
         self.states: dict[str, Tensor] = {}  # [..., A, M], before the next batch's first row
+        self._before: dict[str, Tensor] = {}  # those before the batch that was read last
 
     @torch.no_grad()
     def read(self, rounds: TensorDict, following: TensorDictBase) -> Values:
@@ -51,6 +58,7 @@ class ValueReader:
             rounds: ``[R, ..., A]``, as `CarriedRounds.join` returns them.
             following: what was seen after them, see `keys.FINAL`, `keys.CUT_OFF` and `keys.CUT_OFF_AT`.
         """
+        self._before = dict(self.states)
         if isinstance(self.critic, RecurrentCritic):
             return self._read_in_turn(self.critic, rounds, following)
 
@@ -62,6 +70,13 @@ class ValueReader:
             end.flatten(0, -3)[at] = self._value(self._inputs(cut_off))
 
         return Values(value, end, self._value(self._inputs(following.get(keys.FINAL))), baseline)
+
+    def read_again(self, rounds: TensorDict, following: TensorDictBase) -> Values:
+        """Return the values of the batch that was read last, by the critic as it is now; states stay."""
+        after, self.states = self.states, self._before
+        values = self.read(rounds, following)
+        self.states = after
+        return values
 
     @torch.no_grad()
     def values_of(self, entries: TensorDictBase) -> Tensor:
@@ -83,7 +98,14 @@ class ValueReader:
         return [entries.get(key) for key in self.keys]
 
     def _value(self, inputs: list[Tensor]) -> Tensor:
-        return self.norm.denormalize(self.critic(*inputs))
+        if not self._averages:
+            return self.norm.denormalize(self.critic(*inputs))
+
+        *_, flags = inputs  # [..., A, 1]
+        dim = flags.dim() - 2
+        orders = range(flags.shape[dim])
+        said = [self.critic(*(x.roll(n, dim) for x in inputs)).roll(-n, dim) for n in orders]
+        return self.norm.denormalize(torch.stack(said).mean(0))
 
     def _value_and_baseline(
         self, inputs: list[Tensor], rounds: TensorDictBase

@@ -124,6 +124,13 @@ class PPOConfig:
     advantage: AdvantageKind = AdvantageKind.gae
     """How advantages are estimated: as if the policy had collected the batch itself (gae), or corrected for
     what an older one did (vtrace), see collect.overlap."""
+    recompute_advantages: bool = False
+    """Estimate advantages and value targets anew before each further epoch, by the critic as it then is; what
+    the policy is compared with stays. Lets more epochs pay."""
+    shuffle_members: bool = False
+    """Show the critic the members of a team in another order whenever it learns: for teams of equals, whose
+    order says nothing. Keeps a central critic from learning a batch by heart; needs
+    model.share_parameters=true."""
     time_horizon: Optional[int] = None
     """Decisions of an agent after which its advantages are cut, and a value stands for the rest (as in
     ML-Agents); null: they are cut only where a batch ends."""
