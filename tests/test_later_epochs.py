@@ -160,18 +160,6 @@ def test_a_critic_that_knows_no_order_learns_the_same_from_any() -> None:
             assert torch.allclose(loss, wanted[name], atol=1e-5), name
 
 
-def test_what_the_critic_says_of_a_team_is_a_mean_over_orders() -> None:
-    plain, shuffled = make_learner(), make_learner(shuffle_members=True)
-    batch = make_batch(plain)
-    members = list(batch.clone().unbind(-1))
-    other = torch.stack(members[::-1], -1)
-
-    values = [learner.reader.values_of(seen) for learner in (plain, shuffled) for seen in (batch, other)]
-    assert not torch.allclose(values[0], values[1].flip(-2))
-    assert torch.allclose(values[2], values[3].flip(-2), atol=1e-6)  # of two members these are all orders
-    assert torch.allclose(values[2], (values[0] + values[1].flip(-2)) / 2, atol=1e-6)
-
-
 def test_members_with_networks_of_their_own_keep_their_places() -> None:
     cfg = compose_config(
         ["env=SoccerTwos", "ppo.shuffle_members=true", "model.share_parameters=false"]

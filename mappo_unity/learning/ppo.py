@@ -76,7 +76,7 @@ class PolicyLearner:
         self.params = [*actor.parameters(), *critic.parameters()]
         is_normalized = cfg.normalize_values is not ValueNormKind.none
         self.value_norm = ValueNorm(cfg.value_norm_beta, is_normalized, len(self.rewards.names))
-        self.reader = ValueReader(critic, self.value_norm, cfg.shuffle_members)
+        self.reader = ValueReader(critic, self.value_norm)
 
         inputs = [str(key) for net in (actor, critic) for key in net.in_keys]
         written = [keys.ACTION, keys.LOG_PROB] + [keys.LOG_PROBS] * actor.keeps_components

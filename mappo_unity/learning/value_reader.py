@@ -14,7 +14,6 @@ from torch import Tensor
 
 from mappo_unity import keys
 from mappo_unity.learning.carried import VALUED
-from mappo_unity.learning.networks.critics import CentralCritic
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import BASELINE_STATE, VALUE_STATE, RecurrentCritic
 from mappo_unity.learning.value_norm import ValueNorm
@@ -37,15 +36,10 @@ class ValueReader:
     Args:
         critic: see `learning.networks.actor_critic.make_critic`.
         norm: turns its output into the reward's scale.
-        shuffles: it learns members in any order (`ppo.shuffle_members`): each value of a central critic
-            without a memory is the mean over as many orders as there are members, each of which is once in
-            each place.
     """
 
-    def __init__(self, critic: TensorDictModule, norm: ValueNorm, shuffles: bool = False) -> None:
+    def __init__(self, critic: TensorDictModule, norm: ValueNorm) -> None:
         self.critic, self.norm = critic.module, norm
-        central = any(isinstance(part, CentralCritic) for part in critic.modules())
-        self._averages = shuffles and central
         self.keys = [str(key) for key in critic.in_keys]
         self.states: dict[str, Tensor] = {}  # [..., A, M], before the next batch's first row
         self._before: dict[str, Tensor] = {}  # those before the batch that was read last
@@ -98,14 +92,7 @@ class ValueReader:
         return [entries.get(key) for key in self.keys]
 
     def _value(self, inputs: list[Tensor]) -> Tensor:
-        if not self._averages:
-            return self.norm.denormalize(self.critic(*inputs))
-
-        *_, flags = inputs  # [..., A, 1]
-        dim = flags.dim() - 2
-        orders = range(flags.shape[dim])
-        said = [self.critic(*(x.roll(n, dim) for x in inputs)).roll(-n, dim) for n in orders]
-        return self.norm.denormalize(torch.stack(said).mean(0))
+        return self.norm.denormalize(self.critic(*inputs))
 
     def _value_and_baseline(
         self, inputs: list[Tensor], rounds: TensorDictBase
