@@ -281,8 +281,11 @@ def test_statistics_that_move_with_each_round_have_seen_all_workers_when_a_batch
 # --- training and resuming
 
 
-def test_a_resumed_run_with_workers_is_the_whole_one(tmp_path: Path) -> None:
-    check_resume(tmp_path, "env=DungeonEscape", "env.num_areas=2", "model.memory=gru", ROUND, LOCAL)
+@pytest.mark.parametrize(
+    "lines", [[], ["ppo.epochs=3", "ppo.recompute_advantages=true", "ppo.shuffle_members=true"]]
+)
+def test_a_resumed_run_with_workers_is_the_whole_one(tmp_path: Path, lines: list[str]) -> None:
+    check_resume(tmp_path, "env=DungeonEscape", "env.num_areas=2", "model.memory=gru", ROUND, LOCAL, *lines)
 
 
 @pytest.mark.slow
@@ -293,7 +296,7 @@ def test_a_resumed_run_with_processes_is_the_whole_one(tmp_path: Path, lines: li
 
 def check_resume(folder: Path, *lines: str) -> None:
     """Compare four iterations with two, and two more after a resume."""
-    lines = (*lines, "collect.workers=2", "collect.rounds=16", *SMALL, "keep_checkpoints=9")
+    lines = (*SMALL, "collect.workers=2", "collect.rounds=16", "keep_checkpoints=9", *lines)
     whole, parts = folder / "whole", folder / "parts"
     assert train_main([*lines, "max_steps=400", f"hydra.run.dir={whole}"]) == 0
     states = sorted((whole / "checkpoints").glob("step_*.pt"))
