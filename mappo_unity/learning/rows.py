@@ -62,8 +62,7 @@ class TeamRows:
         """Return what the loss reads."""
         if not self._shuffles:
             return minibatch
-        order = torch.randperm(minibatch.shape[-1])
-        return minibatch[..., order.to(minibatch.get(keys.ADVANTAGE).device)]
+        return minibatch[:, random_order(minibatch.get(keys.ADVANTAGE), dim=1)]
 
 
 class SequenceRows:
@@ -122,7 +121,10 @@ class SequenceRows:
         rounds.set(key, flat.view(*rounds.shape, -1))
 
     def take(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return what the loss reads of these sequences: entries ``[B, L, ...]``, states ``[B, M]``."""
+        """Return what the loss reads of these sequences: entries ``[B, L, ...]``, states ``[B, M]``.
+
+        With ``ppo.shuffle_members`` the critic's inputs have the members in an order of the minibatch's own.
+        """
         own = [key for key in (*self._keys, *_LEARNT) if key in self._rounds]
         out = {key: self._own(key, minibatch) for key in own}
         valid = minibatch.get(_VALID).unsqueeze(-1)
@@ -133,16 +135,12 @@ class SequenceRows:
         for key in (keys.MEMORY, *self._critic.state_names):
             out[key] = self._rounds[key][begin, team, member]
 
-        seen = list(self._critic_keys) + [keys.ACTION] * self._critic.has_baseline
-        if not self._critic.sees_team:
-            of_critic = {key: out[key] for key in seen}
-        elif self._shuffles:
-            team_size = self._rounds[ACTOR_LEARNS].shape[-2]
-            order = torch.rand(len(member), team_size).argsort(-1).to(member.device)
-            of_critic = {key: self._team(key, minibatch, order) for key in seen}
-            member = order.argsort(-1)[torch.arange(len(member), device=member.device), member]
-        else:
-            of_critic = {key: self._team(key, minibatch) for key in seen}
+        seen = self._critic_keys + [keys.ACTION] * self._critic.has_baseline
+        of_critic = {key: self._team(key, minibatch) if self._critic.sees_team else out[key] for key in seen}
+        if self._shuffles and self._critic.sees_team:
+            order = random_order(of_critic[seen[0]], dim=2)
+            of_critic = {key: entry[:, :, order] for key, entry in of_critic.items()}
+            member = order.argsort()[member]
         out |= {TEAM: TensorDict(of_critic, minibatch.batch_size), MEMBER: member}
         return TensorDict(out, minibatch.batch_size)
 
@@ -150,12 +148,13 @@ class SequenceRows:
         team, member = at.get(_TEAM_ROW).unsqueeze(-1), at.get(MEMBER).unsqueeze(-1)
         return self._rounds[key][at.get(_ROUND), team, member]
 
-    def _team(self, key: str, at: TensorDictBase, order: Tensor | None = None) -> Tensor:
-        """Return an entry ``[B, L, A, *]`` of whole teams, members in these orders ``[B, A]``."""
-        team = at.get(_TEAM_ROW).unsqueeze(-1)
-        if order is None:
-            return self._rounds[key][at.get(_ROUND), team]
-        return self._rounds[key][at.get(_ROUND).unsqueeze(-1), team.unsqueeze(-1), order.unsqueeze(1)]
+    def _team(self, key: str, at: TensorDictBase) -> Tensor:
+        return self._rounds[key][at.get(_ROUND), at.get(_TEAM_ROW).unsqueeze(-1)]
+
+
+def random_order(entry: Tensor, dim: int) -> Tensor:
+    """Return a random order of a team's members, int64 ``[A]``, which an entry has in this dimension."""
+    return torch.randperm(entry.shape[dim]).to(entry.device)
 
 
 def make_rows(row_keys: list[str], critic: TensorDictModule, cfg: PPOConfig) -> TeamRows | SequenceRows:

@@ -128,7 +128,7 @@ class PPOConfig:
     """Estimate advantages and value targets anew before each further epoch, by the critic as it then is; what
     the policy is compared with stays. Lets more epochs pay."""
     shuffle_members: bool = False
-    """Show the critic the members of a team in another order whenever it learns: for teams of equals, whose
+    """Show the critic the members of a team in another order with every minibatch: for teams of equals, whose
     order says nothing. Keeps a central critic from learning a batch by heart; needs
     model.share_parameters=true."""
     time_horizon: Optional[int] = None
