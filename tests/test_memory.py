@@ -320,7 +320,7 @@ def test_a_policy_remembers_each_agent_until_its_episode_ends(tmp_path: Path) ->
     [
         (["model.memory=rnn"], "model.memory=rnn"),
         (["model.memory=lstm", "model.memory_size=7"], "must be even with model.memory=lstm"),
-        (["model.memory_of=critic"], "model.memory_of=critic needs a memory"),
+        (["model.memory_of=critic"], "model.memory_of=critic needs model.memory=lstm or gru"),
         (["model.memory=gru", "model.share_parameters=false"], "needs model.share_parameters=true"),
         (["ppo.sequence_length=0"], "ppo.sequence_length=0 is out of range"),
         (["model.critic=poca", "model.share_parameters=false"], "model.critic=poca needs"),

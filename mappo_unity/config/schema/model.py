@@ -206,8 +206,8 @@ class ModelConfig:
     memory_size: int = 128
     """Width of the memory's state (as in ML-Agents: an LSTM's hidden and cell state are half as wide)."""
     memory_of: MemoryOf = MemoryOf.both
-    """Who remembers: actor and critic (both), or the critic alone (critic): it
-    then knows what was seen before, and the policy that is exported has no memory."""
+    """Who remembers: actor and critic (both), or the critic alone (critic), which then knows what was seen
+    before, while the policy that is exported has no memory."""
     mirror: MirrorConfig = field(default_factory=MirrorConfig)
     """Networks for which left and right are the same game, of the one as of the other (docs/mirror.md)."""
     init_log_std: float = 0.0
@@ -231,9 +231,7 @@ class ModelConfig:
             )
 
         if self.memory_of is MemoryOf.critic and self.memory is MemoryKind.none:
-            raise ConfigError(
-                "model.memory_of=critic needs a memory, and model.memory=none: model.memory=lstm or gru"
-            )
+            raise ConfigError("model.memory_of=critic needs model.memory=lstm or gru, not none")
 
         if self.critic is CriticKind.poca and not self.share_parameters:
             raise ConfigError(
