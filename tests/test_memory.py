@@ -20,7 +20,6 @@ from mappo_unity.config.schema import (
     EnvConfig,
     LogConfig,
     MemoryKind,
-    MemoryOf,
     ModelConfig,
     PPOConfig,
     Schedule,
@@ -150,31 +149,6 @@ def test_the_first_minibatch_has_ratio_one_and_its_old_values(
                 assert (baseline - minibatch["baseline"])[minibatch["actor_learns"]].abs().max() < 1e-4
 
 
-@pytest.mark.parametrize("critic", list(CriticKind))
-@pytest.mark.parametrize("probe", ["Staggered", "EarlyDeath"])
-def test_a_critic_that_remembers_alone_gives_in_sequences_what_it_gave_round_by_round(
-    probe: str, critic: CriticKind, tmp_path: Path
-) -> None:
-    ppo = {"minibatch_size": 10**6, "epochs": 1, "lr": 1e-12}
-    cfg = options(probe, critic=critic, memory_of=MemoryOf.critic, ppo=ppo)
-    with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
-        learner = setup.learners["Probe"]
-        assert not learner.actor.has_memory
-        for _ in range(3):
-            part, following = next(batches).of("Probe")
-            assert keys.MEMORY not in part.keys()
-            buffer, _ = learner.prepare(part, following)
-            minibatch = learner.rows.take(buffer[:])
-            learner.loss(minibatch)
-            assert learner.loss.log_ratio.abs().max() < 1e-5
-
-            with torch.no_grad():
-                value, _ = learner.loss._values(minibatch)
-            mask = minibatch["critic_learns"]
-            assert mask.any()
-            assert (value - minibatch[keys.VALUE])[mask].abs().max() < 1e-4
-
-
 # --- learning
 
 
@@ -237,40 +211,18 @@ def test_without_a_memory_it_is_not(probe: str, tmp_path: Path) -> None:
     assert share_right(learn(cfg, tmp_path, 10)) < 0.6
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_critic_that_remembers_alone_knows_how_long_an_episode_has_lasted(
-    kind: MemoryKind, tmp_path: Path
-) -> None:
-    # nothing is observed, and each episode ends with the fifth decision
-    cfg = options("RealEnd", 20, {"lr": 1e-2}, memory=kind, memory_of=MemoryOf.critic)
-    with set_up(cfg, tmp_path) as setup, setup.collecting() as batches:
-        learner = setup.learners["Probe"]
-        for _ in range(60):
-            setup.learn(next(batches), 0.0)
-        batch, following = next(batches).of("Probe")
-        rounds = learner.carried.join(batch)
-        value = learner.reader.read(rounds, following).value
-
-    first = rounds[keys.FIRST]
-    last = rounds[keys.TERMINATED]
-    assert first.any() and last.any()
-    assert value[first].mean().item() == pytest.approx(sum(0.99**k for k in range(5)), abs=0.3)
-    assert value[last].mean().item() == pytest.approx(1.0, abs=0.3)
-
-
 # --- runs
 
 SMALL = ["env=Hallway", "env.num_areas=4", "model.hidden=[16]", "model.memory_size=8", "log.progress=false"]
 SMALL += ["collect.batch_size=256", "ppo.minibatch_size=128", "ppo.sequence_length=16", "log.loggers=[]"]
 
 
-@pytest.mark.parametrize(("kind", "of"), [("lstm", "both"), ("gru", "both"), ("gru", "critic")])
+@pytest.mark.parametrize("kind", ["lstm", "gru"])
 def test_a_run_is_resumed_to_the_bit_and_its_export_plays_alike(
-    kind: str, of: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    lines = [*SMALL, f"model.memory={kind}", f"model.memory_of={of}"]
-    lines += ["ppo.lr_schedule=constant", "ppo.entropy_schedule=constant"]
+    lines = [*SMALL, f"model.memory={kind}", "ppo.lr_schedule=constant", "ppo.entropy_schedule=constant"]
     assert train_main([*lines, "max_steps=1024", "hydra.run.dir=whole"]) == 0
     assert train_main([*lines, "max_steps=512", "hydra.run.dir=parts"]) == 0
     assert train_main(["resume=parts", "max_steps=1024"]) == 0
@@ -279,13 +231,7 @@ def test_a_run_is_resumed_to_the_bit_and_its_export_plays_alike(
     for part in ("actor", "critic"):
         saved = one["learners"]["Hallway"][part], two["learners"]["Hallway"][part]
         assert all(torch.equal(saved[0][name], saved[1][name]) for name in saved[0])
-    if of == "both":
-        assert torch.equal(one["memories"]["Hallway"], two["memories"]["Hallway"])
-    else:
-        assert "Hallway" not in one["memories"]
-        states = [saved["learners"]["Hallway"]["critic_states"] for saved in (one, two)]
-        assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
-        assert states[0]
+    assert torch.equal(one["memories"]["Hallway"], two["memories"]["Hallway"])
 
     # the export was compared with the actor when it was written, its memory too
     assert Path("whole/checkpoints/final.onnx").is_file()
@@ -320,7 +266,6 @@ def test_a_policy_remembers_each_agent_until_its_episode_ends(tmp_path: Path) ->
     [
         (["model.memory=rnn"], "model.memory=rnn"),
         (["model.memory=lstm", "model.memory_size=7"], "must be even with model.memory=lstm"),
-        (["model.memory_of=critic"], "model.memory_of=critic needs model.memory=lstm or gru"),
         (["model.memory=gru", "model.share_parameters=false"], "needs model.share_parameters=true"),
         (["ppo.sequence_length=0"], "ppo.sequence_length=0 is out of range"),
         (["model.critic=poca", "model.share_parameters=false"], "model.critic=poca needs"),

@@ -424,22 +424,6 @@ def test_each_behavior_has_a_file_of_its_own(shared: Path, tmp_path: Path, capsy
 # --- mistakes
 
 
-@pytest.mark.parametrize("where", ["model", "behaviors.Probe.model"])
-def test_a_critic_may_remember_though_the_file_does_not(
-    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("own.onnx").write_bytes(data_of(make([[1]], 0, [2]), [[1]]))
-    read_network.cache_clear()
-
-    small = [line for line in TINY if not line.startswith("model.")]
-    lines = ["init_from=own.onnx", f"{where}.memory=gru", f"{where}.memory_of=critic", "hydra.run.dir=run"]
-    assert train_main([*small, *lines]) == 0
-    learner = newest(Path("run"))["learners"]["Probe"]
-    assert learner["critic_states"]
-    assert not any("memory" in name for name in learner["actor"])
-
-
 def strange_model(path: Path, op: str) -> None:
     """Write a model whose only output comes from an operator that no policy of ours has."""
     node = onnx.helper.make_node(op, ["obs_0"], ["continuous_actions"])

@@ -29,7 +29,6 @@ from mappo_unity.learning.loss import ACTOR_LEARNS, MaskedClipPPOLoss, move_with
 from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
 from mappo_unity.learning.networks.encoders import channels_first, running_norms, update_norms
 from mappo_unity.learning.networks.poca import PocaCritic
-from mappo_unity.learning.networks.recurrent import RecurrentCritic
 from mappo_unity.learning.optimizer import (
     CriticWarmup,
     LearningRates,
@@ -83,7 +82,7 @@ class PolicyLearner:
         written = [keys.ACTION, keys.LOG_PROB] + [keys.LOG_PROBS] * actor.keeps_components
         self.row_keys = list(dict.fromkeys([*inputs, *written]))
         self.has_baseline = any(isinstance(m, PocaCritic) for m in critic.modules())
-        read = self.row_keys + [keys.FIRST] * isinstance(critic.module, RecurrentCritic)
+        read = self.row_keys + [keys.FIRST] * actor.has_memory
         self.carried = CarriedRounds(read, self.has_baseline, channels_first(critic))
         self.rows = make_rows(self.row_keys, critic, cfg)
 

@@ -133,8 +133,7 @@ class SequenceRows:
 
         begin, team, member = minibatch.get(_ROUND)[:, 0], minibatch.get(_TEAM_ROW), minibatch.get(MEMBER)
         for key in (keys.MEMORY, *self._critic.state_names):
-            if key in self._rounds:  # an actor may have no memory
-                out[key] = self._rounds[key][begin, team, member]
+            out[key] = self._rounds[key][begin, team, member]
 
         seen = self._critic_keys + [keys.ACTION] * self._critic.has_baseline
         of_critic = {key: self._team(key, minibatch) if self._critic.sees_team else out[key] for key in seen}
@@ -159,7 +158,7 @@ def random_order(entry: Tensor, dim: int) -> Tensor:
 
 
 def make_rows(row_keys: list[str], critic: TensorDictModule, cfg: PPOConfig) -> TeamRows | SequenceRows:
-    """Return what an update learns on: sequences where the critic has a memory, else team rows."""
+    """Return what an update learns on: sequences where the critic (and so the actor) has a memory."""
     if not isinstance(critic.module, RecurrentCritic):
         return TeamRows(row_keys, cfg.shuffle_members)
     return SequenceRows(row_keys, [str(key) for key in critic.in_keys], critic.module, cfg)

@@ -37,13 +37,6 @@ class MemoryKind(Enum):
     gru = "gru"
 
 
-class MemoryOf(Enum):
-    """Which networks have the memory."""
-
-    both = "both"
-    critic = "critic"
-
-
 class ImageKind(Enum):
     """Layers between an image and its features."""
 
@@ -205,9 +198,6 @@ class ModelConfig:
     observation only."""
     memory_size: int = 128
     """Width of the memory's state (as in ML-Agents: an LSTM's hidden and cell state are half as wide)."""
-    memory_of: MemoryOf = MemoryOf.both
-    """Who remembers: actor and critic (both), or the critic alone (critic), which then knows what was seen
-    before, while the policy that is exported has no memory."""
     mirror: MirrorConfig = field(default_factory=MirrorConfig)
     """Networks for which left and right are the same game, of the one as of the other (docs/mirror.md)."""
     init_log_std: float = 0.0
@@ -230,9 +220,6 @@ class ModelConfig:
                 "member of a team have no memory yet"
             )
 
-        if self.memory_of is MemoryOf.critic and self.memory is MemoryKind.none:
-            raise ConfigError("model.memory_of=critic needs model.memory=lstm or gru, not none")
-
         if self.critic is CriticKind.poca and not self.share_parameters:
             raise ConfigError(
                 "model.critic=poca needs model.share_parameters=true: its value is the whole team's"
@@ -242,11 +229,6 @@ class ModelConfig:
             self._check_mirrored()
 
         within("model.init_log_std", self.init_log_std, *LOG_STD_RANGE)
-
-    @property
-    def actor_remembers(self) -> bool:
-        """Whether the actor has a memory."""
-        return self.memory is not MemoryKind.none and self.memory_of is MemoryOf.both
 
     def _check_mirrored(self) -> None:
         for option, value, needed in (

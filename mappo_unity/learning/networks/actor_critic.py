@@ -192,7 +192,7 @@ def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelC
 
     if cfg.share_parameters or team_size == 1:
         net: nn.Module = Actor(obs, layout, cfg)
-        if cfg.actor_remembers:
+        if cfg.memory is not MemoryKind.none:
             net = RecurrentActor(net, cfg)
             init_head(net.head, cfg, layout.num_means)
     else:

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from mappo_unity.config.option_table import show_value
 from mappo_unity.config.options_file import file_root
 from mappo_unity.config.overrides import given_options, parse
-from mappo_unity.config.schema import Config, MemoryKind, MemoryOf, MirrorConfig, ModelConfig, show_mirror
+from mappo_unity.config.schema import Config, MirrorConfig, ModelConfig, show_mirror
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.policy_files import Kind, Source, check_checkpoint, locate
 
@@ -57,28 +57,25 @@ def adopt_file_options(config: Config, lines: list[str], file: Path | None = Non
 
     behaviors = copy.deepcopy(config.behaviors)
     shape = _shape_of(config.init_from, "init_from")
-    of_all = _of_actor(shape, config.model.memory_of)
-    model = _adopted(config.model, of_all, given, "model", str(config.init_from))
+    model = _adopted(config.model, shape, given, "model", str(config.init_from))
 
     for name, own in behaviors.items():
         if not isinstance(own, dict) or not isinstance(own.get("model") or {}, dict):
             continue  # `behavior_config` says what is wrong with it
         option = f"behaviors.{name}"
         theirs = dict(own.get("model") or {})
-        memory_of = theirs.get("memory_of", config.model.memory_of)
         given_to_it = {key: value for key, value in theirs.items() if (name, key) in given_to_behaviors}
         if "init_from" in own:
             # what the file of the other behaviors changed is not meant for this one
-            back = {key: _plain(getattr(config.model, key)) for key in of_all if key not in theirs}
-            shape_of_own = _of_actor(_shape_of(own["init_from"], f"{option}.init_from"), memory_of)
+            back = {key: _plain(getattr(config.model, key)) for key in shape if key not in theirs}
+            shape_of_own = _shape_of(own["init_from"], f"{option}.init_from")
             _check_given(given_to_it, shape_of_own, f"{option}.model", str(own["init_from"]))
             if shape or shape_of_own:
                 own["model"] = back | theirs | shape_of_own
         else:
-            of_it = _of_actor(shape, memory_of)
-            _check_given(given_to_it, of_it, f"{option}.model", str(config.init_from))
+            _check_given(given_to_it, shape, f"{option}.model", str(config.init_from))
             if shape:
-                own["model"] = {key: value for key, value in theirs.items() if key not in of_it}
+                own["model"] = {key: value for key, value in theirs.items() if key not in shape}
 
     return replace(config, model=model, behaviors=behaviors)
 
@@ -118,13 +115,6 @@ def _shape_of(where: Any, option: str) -> dict[str, Any]:
         return read_network(source.path).options
     check_checkpoint(source)
     return {}
-
-
-def _of_actor(shape: dict[str, Any], memory_of: Any) -> dict[str, Any]:
-    """Return the options without `memory=none` where the critic alone remembers, of which no file tells."""
-    if _plain(memory_of) != MemoryOf.critic.value or shape.get("memory") != MemoryKind.none.value:
-        return shape
-    return {key: value for key, value in shape.items() if key != "memory"}
 
 
 def _adopted(
