@@ -139,6 +139,7 @@ class PolicyLearner:
         self, batch: TensorDictBase, following: TensorDictBase
     ) -> tuple[ReplayBuffer | None, dict[str, float]]:
         """Add advantages and targets; return a buffer of the rows that are learnt, None if there are none."""
+        batch, following = self.reader.traced(batch, following)
         rounds = self.carried.join(batch)
         values = self.reader.read(rounds, following)
 

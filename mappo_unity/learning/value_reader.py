@@ -1,6 +1,7 @@
 """What a critic says of a batch: values of its rows, of terminal observations, of the row after the last.
 
-With a memory the rounds are gone through one by one, and each slot's state is kept for the next batch.
+With a memory the rounds are gone through one by one, and each slot's state is kept for the next batch; so are
+traces of what it observed.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from mappo_unity import keys
 from mappo_unity.learning.carried import VALUED
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import BASELINE_STATE, VALUE_STATE, RecurrentCritic
+from mappo_unity.learning.networks.traces import ObservationTraces
 from mappo_unity.learning.value_norm import ValueNorm
 
 
@@ -41,8 +43,42 @@ class ValueReader:
     def __init__(self, critic: TensorDictModule, norm: ValueNorm) -> None:
         self.critic, self.norm = critic.module, norm
         self.keys = [str(key) for key in critic.in_keys]
+        self.traces = next((m for m in critic.modules() if isinstance(m, ObservationTraces)), None)
         self.states: dict[str, Tensor] = {}  # [..., A, M], before the next batch's first row
         self._before: dict[str, Tensor] = {}  # those before the batch that was read last
+
+    @torch.no_grad()
+    def traced(
+        self, batch: TensorDictBase, following: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """Return a batch and what followed it with `keys.TRACES`, where the critic reads them.
+
+        Args:
+            batch: ``[T, ..., A]``, as collected.
+            following: what was seen after it, see `keys.FINAL`, `keys.CUT_OFF` and `keys.CUT_OFF_AT`.
+        """
+        net = self.traces
+        if net is None:
+            return batch, following
+
+        def walk(state: Tensor, rows: TensorDictBase) -> Tensor:
+            return net.walk(state, *(rows.get(key) for key in (keys.OBS, keys.FIRST, keys.ACTING)))
+
+        state = self.states.get(keys.TRACES)
+        slots = batch.shape[1:]
+        if state is None or state.shape[:-1] != slots:
+            state = torch.zeros(*slots, net.size, device=batch.get(keys.OBS).device)
+        rows = walk(state, batch)
+        self.states[keys.TRACES] = rows[-1]
+
+        final, cut_off = following.get(keys.FINAL), following.get(keys.CUT_OFF)
+        # a terminal observation follows the slot's last decision
+        ended = net.after(rows.flatten(0, -3)[following.get(keys.CUT_OFF_AT)], cut_off.get(keys.OBS))
+        after = {
+            keys.FINAL: final.copy().set(keys.TRACES, walk(rows[-1], final.unsqueeze(0))[0]),
+            keys.CUT_OFF: cut_off.copy().set(keys.TRACES, ended),
+        }
+        return batch.copy().set(keys.TRACES, rows), following.copy().update(after)
 
     @torch.no_grad()
     def read(self, rounds: TensorDict, following: TensorDictBase) -> Values:

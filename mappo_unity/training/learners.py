@@ -63,7 +63,7 @@ def make_learners(
         note_unmarked(name, sensors, note)
         check_sides(name, sensors, model.image_encoder)
         layout = ActionLayout.from_spec(behavior.spec.action_spec, model.flatten_branches)
-        check_mirror(name, obs, layout, model)
+        check_columns(name, obs, layout, model)
         check_network_memory(name, obs, layout, team_size, model, rewards)
 
         # Built after the check, so that what does not fit is refused by a line of ours.
@@ -110,10 +110,12 @@ def check_learners(cfg: Config, env: Played, learners: Mapping[str, PolicyLearne
             )
 
 
-def check_mirror(name: str, obs: ObsLayout, layout: ActionLayout, model: ModelConfig) -> None:
-    """Raise ConfigError, naming the policy, where `model.mirror` does not fit it."""
+def check_columns(name: str, obs: ObsLayout, layout: ActionLayout, model: ModelConfig) -> None:
+    """Raise ConfigError, naming the policy, where `model.mirror` or `model.critic_traces` does not fit it."""
     try:
         make_mirror(model.mirror, obs, layout)
+        if model.critic_traces:
+            model.columns_traced(obs.vector)
     except ConfigError as error:
         raise ConfigError(f"{error} ({name})") from error
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
 from typing import Any, Optional
 
-from mappo_unity.config.schema.checks import at_least, widths, within
+from mappo_unity.config.schema.checks import at_least, between, widths, within
 from mappo_unity.errors import ConfigError
 
 
@@ -198,6 +198,12 @@ class ModelConfig:
     observation only."""
     memory_size: int = 128
     """Width of the memory's state (as in ML-Agents: an LSTM's hidden and cell state are half as wide)."""
+    critic_traces: list[float] = field(default_factory=list)
+    """Let the critic remember: decays, between 0 and 1, of moving averages of each agent's vector
+    observations over its episode, such as [0.8, 0.95]; none: it sees the newest ones alone."""
+    critic_traced: list[int] = field(default_factory=list)
+    """Columns of the vector observations, all sensors in one, that model.critic_traces averages: runs, of two
+    numbers each, first column and length; none: all."""
     mirror: MirrorConfig = field(default_factory=MirrorConfig)
     """Networks for which left and right are the same game, of the one as of the other (docs/mirror.md)."""
     init_log_std: float = 0.0
@@ -225,15 +231,49 @@ class ModelConfig:
                 "model.critic=poca needs model.share_parameters=true: its value is the whole team's"
             )
 
+        self._check_traced()
         if self.mirror.is_used:
             self._check_mirrored()
 
         within("model.init_log_std", self.init_log_std, *LOG_STD_RANGE)
 
+    def columns_traced(self, vector: int) -> list[int]:
+        """Return the columns that `critic_traces` averages, of `vector` columns.
+
+        Raises:
+            ConfigError: they have no such column, or there are none.
+        """
+        begins, lengths = self.critic_traced[::2], self.critic_traced[1::2]
+        runs = list(zip(begins, lengths)) or [(0, vector)]
+        columns = [column for begin, length in runs for column in range(begin, begin + length)]
+        if not vector:
+            raise ConfigError(
+                f"model.critic_traces={list(self.critic_traces)} averages vector observations, of which "
+                "there are none; give model.critic_traces=[]"
+            )
+        if max(columns) >= vector:
+            raise ConfigError(
+                f"model.critic_traced={show_numbers(self.critic_traced)} names column {max(columns)}; there "
+                f"are {vector} columns of vector observations, counted from 0"
+            )
+        return columns
+
+    def _check_traced(self) -> None:
+        for decay in self.critic_traces:
+            between("model.critic_traces", decay, 0, 1)
+
+        numbers = self.critic_traced
+        if len(numbers) % 2 or any(n < 0 for n in numbers[::2]) or any(n < 1 for n in numbers[1::2]):
+            raise ConfigError(
+                f"model.critic_traced={show_numbers(numbers)} must hold runs of columns, two numbers each: "
+                "the first column, from 0 on, and how many, from 1 on"
+            )
+
     def _check_mirrored(self) -> None:
         for option, value, needed in (
             ("memory", self.memory, MemoryKind.none),
             ("flatten_branches", self.flatten_branches, False),
+            ("critic_traces", list(self.critic_traces), []),
         ):
             if value != needed:
                 raise ConfigError(

@@ -212,6 +212,8 @@ def make_critic(
         layout: the sizes of an action, which MA-POCA's baseline reads.
         streams: reward streams V, which have a value each.
     """
+    if cfg.critic_traces:
+        obs = replace(obs, traces=tuple(cfg.critic_traces), traced=tuple(cfg.columns_traced(obs.vector)))
     local = team_size == 1 or cfg.critic is CriticKind.local
     in_keys = list(obs.keys) if local else [*obs.keys, keys.PRESENT, keys.DEPARTED]
 

@@ -20,6 +20,7 @@ from mappo_unity.config.schema import ImageKind
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.attention import ENTITY_FEATURES, EntityEncoder
 from mappo_unity.learning.networks.images import IMAGE_FEATURES, ImageEncoder
+from mappo_unity.learning.networks.traces import ObservationTraces
 from mappo_unity.learning.reduction import ALONE, Reduction
 from mappo_unity.scenes.contract.images import FIRST, channel_dim, guessed_channel_dim
 from mappo_unity.scenes.contract.sensors import is_goal, is_set
@@ -35,6 +36,7 @@ class ObsLayout:
     `sets`: sensors of variable length, ``[N, F]``: up to N entities of F features.
     `goal_vectors`: which columns of the vectors are goal signals, as pairs of first and behind the last.
     `goal_keys`: which images and sets are.
+    `traces`, `traced`: decays of a critic's `ObservationTraces`, and the vectors' columns that it traces.
     """
 
     vector: int
@@ -43,6 +45,8 @@ class ObsLayout:
     sets: tuple[tuple[str, tuple[int, ...]], ...] = ()
     goal_vectors: tuple[tuple[int, int], ...] = ()
     goal_keys: tuple[str, ...] = ()
+    traces: tuple[float, ...] = ()
+    traced: tuple[int, ...] = ()
 
     @classmethod
     def from_shapes(
@@ -109,12 +113,14 @@ class ObsLayout:
     @property
     def keys(self) -> list[str]:
         """Entries that networks read, in the order of `Encoder.forward`'s arguments."""
-        return ([keys.OBS] if self.vector else []) + [key for key, _ in (*self.images, *self.sets)]
+        vectors = ([keys.OBS] if self.vector else []) + ([keys.TRACES] if self.traced else [])
+        return vectors + [key for key, _ in (*self.images, *self.sets)]
 
     @property
     def team_dims(self) -> list[int]:
         """Where the members of a team stand in each of these entries, counted from the end."""
-        return ([-2] if self.vector else []) + [-1 - len(shape) for _, shape in (*self.images, *self.sets)]
+        vectors = [-2] * (bool(self.vector) + bool(self.traced))
+        return vectors + [-1 - len(shape) for _, shape in (*self.images, *self.sets)]
 
 
 class RunningNorm(nn.Module):
@@ -181,7 +187,7 @@ def update_norms(norms: Sequence[RunningNorm], entries: TensorDictBase, reductio
 
 
 class Encoder(nn.Module):
-    """Observation entries of an agent to its features ``[..., F]``: vectors, then images, then entities.
+    """Observation entries of an agent to its features ``[..., F]``: vectors, traces, images, entities.
 
     Args:
         layout: the entries.
@@ -202,6 +208,7 @@ class Encoder(nn.Module):
     ) -> None:
         super().__init__()
         self.norm: nn.Module = RunningNorm(layout.vector) if normalize and layout.vector else nn.Identity()
+        self.traces = ObservationTraces(layout.traces, layout.traced) if layout.traced else None
         dims = layout.channel_dims or (FIRST,) * len(layout.images)
         images = [ImageEncoder(s, dim, kind, width) for (_, s), dim in zip(layout.images, dims)]
         self.images = nn.ModuleList(images)
@@ -209,25 +216,33 @@ class Encoder(nn.Module):
         self.vector, self.has_vector = layout.vector, layout.vector > 0
 
         widths = [(key, net.size) for (key, _), net in zip(layout.images, images)]
-        around = layout.vector + sum(size for _, size in widths)
+        vectors = layout.vector + (self.traces.size if self.traces is not None else 0)
+        around = vectors + sum(size for _, size in widths)
         sizes = [shape[1] for _, shape in layout.sets]
         self.sets = EntityEncoder(sizes, around) if sizes else None
         self.size = around + (ENTITY_FEATURES if sizes else 0)
-        self.goal_columns = _goal_columns(layout, widths)
+        self.goal_columns = _goal_columns(layout, widths, vectors)
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return features; the arguments come in the order of `ObsLayout.keys`."""
-        if not len(self.images) and self.sets is None:
+        if not len(self.images) and self.sets is None and self.traces is None:
             return self.norm(obs[0])
 
-        first = int(self.has_vector)
+        first = int(self.has_vector) + (self.traces is not None)
         behind = first + len(self.images)
         parts = [self.norm(obs[0])] if self.has_vector else []
+        parts += [self._traced(self.traces, obs[1])] if self.traces is not None else []
         parts += [net(in_floats(image)) for net, image in zip(self.images, obs[first:behind])]
         if self.sets is not None:
             around = torch.cat(parts, -1) if parts else None
             parts.append(self.sets(around, obs[behind:]))
         return torch.cat(parts, -1)
+
+    def _traced(self, net: ObservationTraces, traces: Tensor) -> Tensor:
+        """Return what traces of the observations, as `norm` gives them, would be."""
+        for norm in running_norms(self.norm):
+            return net(traces, norm.mean, norm.inv_std).clamp(-OBS_CLIP, OBS_CLIP)
+        return traces
 
 
 def channels_first(net: nn.Module) -> list[str]:
@@ -249,15 +264,15 @@ def in_type(image: Tensor, dtype: torch.dtype) -> Tensor:
     return in_floats(image) if dtype != torch.uint8 else (image * 255).round().to(dtype)
 
 
-def _goal_columns(layout: ObsLayout, images: list[tuple[str, int]]) -> list[int]:
+def _goal_columns(layout: ObsLayout, images: list[tuple[str, int]], start: int) -> list[int]:
     """Return the columns of features that are goals; entities share their columns.
 
     Args:
         layout: the entries.
         images: key and features of each.
+        start: the first column behind the vectors and their traces.
     """
     columns = [column for begin, end in layout.goal_vectors for column in range(begin, end)]
-    start = layout.vector
     for key, size in images:
         columns += range(start, start + size) if key in layout.goal_keys else []
         start += size
