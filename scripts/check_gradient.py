@@ -11,8 +11,8 @@ It plays a checkpoint's own scene as it explores, without learning, and prints
   mean inner product of two batches' gradients over the mean square of one). The rest is noise, which points
   elsewhere in every batch.
 
-For scenes of one behavior whose agents have no team, see vectors, move continuously and have no memory, such
-as Walker.
+For scenes of one behavior whose agents have no team, see vectors, move continuously, without a memory
+or traces, such as Walker.
 """
 
 from __future__ import annotations
@@ -56,10 +56,11 @@ class Learner:
         layout, model = state["layout"][name], model_from_saved(state["model"][name])
         sensors = layout["sensors"]
         is_plain = not others and layout["team_size"] == 1 and model.memory.value == "none"
+        is_plain = is_plain and not model.critic_traces
         if not is_plain or layout["branches"] or any(len(shape) > 1 for shape in sensors):
             raise ConfigError(
                 f"run={path}: the script takes one behavior of single agents that see vectors, move "
-                "continuously and have no memory"
+                "continuously, without a memory or traces"
             )
 
         self.actor = actor_of(state, name)
