@@ -29,7 +29,7 @@ RUNS = {
     "GridFoodCollector": ["env=GridFoodCollector", "env.num_areas=1"],
 }
 """Options of each run, besides `_COMMON`; its length is given by `STEPS`."""
-STEPS = {"3DBall": 864, "SoccerTwos": 1152, "DungeonEscape": 590, "WallJump": 570, "GridFoodCollector": 720}
+STEPS = {"3DBall": 864, "SoccerTwos": 1152, "DungeonEscape": 570, "WallJump": 570, "GridFoodCollector": 720}
 """Agent decisions with which the third iteration ends (or that the third one passes)."""
 RESUMED = "DungeonEscape"
 
