@@ -224,7 +224,9 @@ def test_what_does_not_go_is_refused(lines: list[str], message: str) -> None:
 def test_columns_that_are_not_there_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = [*SMALL, "model.critic_traced=[365,7]", f"hydra.run.dir={tmp_path / 'run'}"]
     assert train_main(lines) == 2
-    assert "names column 371; there are 371 columns of vector observations" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "names column 371; there are 371 columns of vector observations" in error
+    assert "model.critic_traces=[] does without (DungeonEscape)" in error
 
 
 def test_a_game_of_images_alone_has_nothing_to_trace() -> None:

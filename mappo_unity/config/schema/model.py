@@ -254,7 +254,8 @@ class ModelConfig:
         if max(columns) >= vector:
             raise ConfigError(
                 f"model.critic_traced={show_numbers(self.critic_traced)} names column {max(columns)}; there "
-                f"are {vector} columns of vector observations, counted from 0"
+                f"are {vector} columns of vector observations, counted from 0; model.critic_traces=[] does "
+                "without"
             )
         return columns
 
