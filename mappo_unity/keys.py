@@ -23,8 +23,8 @@ LOG_PROBS = "action_log_probs"  # float32 [..., A, C + K]: of each component, wh
 MASK = "action_mask"  # bool [..., A, sum of branches]: True = allowed (Unity's sense, turned round)
 ACTING = "acting"  # bool [..., A, 1]: the agent requested a decision in this round
 MEMORY = "memory"  # float32 [..., A, M]: the actor's state under which the agent acts
-TRACES = "traces"  # float32 [..., A, n]: what the critic remembers, see learning.networks.traces
 MEMORY_AFTER = "memory_after"  # float32 [..., A, M]: the actor's state after that decision
+TRACES = "traces"  # float32 [..., A, n]: what the critic remembers, see learning.networks.traces
 PLAYER = "player"  # int64 [..., A, 1]: who plays the agent, `LEARNER` or the number of an opponent
 PRESENT = "present"  # bool [..., A, 1]: an agent holds the slot (or held it and departed)
 DEPARTED = "departed"  # bool [..., A, 1]: the agent ended for good while its team plays on

@@ -64,11 +64,7 @@ class ValueReader:
         def walk(state: Tensor, rows: TensorDictBase) -> Tensor:
             return net.walk(state, *(rows.get(key) for key in (keys.OBS, keys.FIRST, keys.ACTING)))
 
-        state = self.states.get(keys.TRACES)
-        slots = batch.shape[1:]
-        if state is None or state.shape[:-1] != slots:
-            state = torch.zeros(*slots, net.size, device=batch.get(keys.OBS).device)
-        rows = walk(state, batch)
+        rows = walk(self._state(keys.TRACES, batch.get(keys.OBS)[0], net.size), batch)
         self.states[keys.TRACES] = rows[-1]
 
         final, cut_off = following.get(keys.FINAL), following.get(keys.CUT_OFF)
@@ -168,10 +164,7 @@ class ValueReader:
         self, critic: RecurrentCritic, name: str, features: Tensor, first: Tensor, valued: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return outputs, states before and states after each row; the last of these is kept."""
-        state = self.states.get(name)
-        if state is None or state.shape[:-1] != first.shape[1:-1]:
-            state = features.new_zeros(*first.shape[1:-1], critic.memory.state_size)
-
+        state = self._state(name, features[0], critic.memory.state_size)
         outputs, before, after = [], [], []
         for row in range(len(features)):
             state = torch.where(first[row], 0.0, state)
@@ -183,6 +176,13 @@ class ValueReader:
 
         self.states[name] = state
         return torch.stack(outputs), torch.stack(before), torch.stack(after)
+
+    def _state(self, name: str, row: Tensor, size: int) -> Tensor:
+        """Return the state ``[..., A, size]`` before the batch whose first row is given, ``[..., A, *]``."""
+        state = self.states.get(name)
+        if state is None or state.shape[:-1] != row.shape[:-1]:
+            return row.new_zeros(*row.shape[:-1], size)
+        return state
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what resuming needs."""
