@@ -40,6 +40,7 @@ MODELS: list[dict[str, Any]] = [
     {"share_parameters": False},
     {"memory": MemoryKind.lstm},
     {"memory": MemoryKind.gru, "critic": CriticKind.poca},
+    {"memory": MemoryKind.traces},
 ]
 
 

@@ -100,7 +100,7 @@ def test_a_clone_does_what_was_shown(spec: ActionSpec) -> None:
     assert torch.equal(mode[:, size:], expert.steps.action[:, size:])
 
 
-@pytest.mark.parametrize("memory", [MemoryKind.lstm, MemoryKind.gru])
+@pytest.mark.parametrize("memory", [MemoryKind.lstm, MemoryKind.gru, MemoryKind.traces])
 def test_a_clone_with_a_memory_remembers_what_was_shown_at_first(memory: MemoryKind) -> None:
     spec = ActionSpec(0, (2,))
     demo = demonstration(spec, (20,) * 12, recalls=True)
@@ -111,12 +111,13 @@ def test_a_clone_with_a_memory_remembers_what_was_shown_at_first(memory: MemoryK
     assert losses[-1] > 0.5
 
 
-def test_states_before_pieces_are_those_of_the_whole_episode() -> None:
+@pytest.mark.parametrize("memory", [MemoryKind.lstm, MemoryKind.traces])
+def test_states_before_pieces_are_those_of_the_whole_episode(memory: MemoryKind) -> None:
     spec = ActionSpec(0, (2,))
-    actor = actor_of(spec, MemoryKind.lstm)
+    actor = actor_of(spec, memory)
     cloning, _ = clone(actor, demonstration(spec, (9, 4)), 1)
     states, table = cloning._states(), cloning._expert.steps.table[0]
-    state = torch.zeros(1, 16)
+    state = torch.zeros(1, actor.memory_size)
     for number, row in enumerate(range(9)):
         assert torch.allclose(states[number], state[0], atol=1e-6)
         state = actor[0].module(table[row : row + 1], state)[1].detach()

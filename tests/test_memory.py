@@ -94,11 +94,12 @@ def test_sequences_by_hand() -> None:
 # --- collecting
 
 
+@pytest.mark.parametrize("kind", [MemoryKind.lstm, MemoryKind.traces])
 @pytest.mark.parametrize("probe", ["Staggered", "EarlyDeath", "TimeLimit", "RealEnd"])
 def test_a_memory_is_zero_at_first_frozen_while_nobody_asks_and_carried_over(
-    probe: str, tmp_path: Path
+    probe: str, kind: MemoryKind, tmp_path: Path
 ) -> None:
-    with set_up(options(probe), tmp_path) as setup, setup.collecting() as batches:
+    with set_up(options(probe, memory=kind), tmp_path) as setup, setup.collecting() as batches:
         actor: Any = setup.learners["Probe"].actor
         parts = [next(batches).of("Probe")[0] for _ in range(3)]
         rounds = torch.cat([part.exclude("next") for part in parts], 0)
@@ -194,6 +195,11 @@ def share_right(batch: Any) -> float:
         ("StaggeredRecall", 124, 200, {"memory": MemoryKind.lstm}),
         ("TeamRecall", 44, 200, {"memory": MemoryKind.lstm, "critic": CriticKind.central}),
         ("TeamRecall", 44, 200, {"memory": MemoryKind.lstm, "critic": CriticKind.poca}),
+        ("Recall", 44, 200, {"memory": MemoryKind.traces}),
+        ("LongRecall", 122, 600, {"memory": MemoryKind.traces, "memory_traces": [0.8, 0.98]}),
+        ("StaggeredRecall", 124, 200, {"memory": MemoryKind.traces}),
+        ("TeamRecall", 44, 200, {"memory": MemoryKind.traces, "critic": CriticKind.central}),
+        ("TeamRecall", 44, 200, {"memory": MemoryKind.traces, "critic": CriticKind.poca}),
     ],
 )
 def test_what_was_seen_long_ago_is_known(
@@ -217,7 +223,7 @@ SMALL = ["env=Hallway", "env.num_areas=4", "model.hidden=[16]", "model.memory_si
 SMALL += ["collect.batch_size=256", "ppo.minibatch_size=128", "ppo.sequence_length=16", "log.loggers=[]"]
 
 
-@pytest.mark.parametrize("kind", ["lstm", "gru"])
+@pytest.mark.parametrize("kind", ["lstm", "gru", "traces"])
 def test_a_run_is_resumed_to_the_bit_and_its_export_plays_alike(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -267,6 +273,10 @@ def test_a_policy_remembers_each_agent_until_its_episode_ends(tmp_path: Path) ->
         (["model.memory=rnn"], "model.memory=rnn"),
         (["model.memory=lstm", "model.memory_size=7"], "must be even with model.memory=lstm"),
         (["model.memory=gru", "model.share_parameters=false"], "needs model.share_parameters=true"),
+        (["model.memory=traces", "model.share_parameters=false"], "needs model.share_parameters=true"),
+        (["model.memory=traces", "model.memory_traces=[]"], "leaves nothing to model.memory=traces"),
+        (["model.memory_traces=[1]"], "model.memory_traces=1.0 is out of range"),
+        (["model.memory_traced=[3]"], r"model.memory_traced=\[3\] must hold runs of columns"),
         (["ppo.sequence_length=0"], "ppo.sequence_length=0 is out of range"),
         (["model.critic=poca", "model.share_parameters=false"], "model.critic=poca needs"),
         (["ppo.value_norm_update=minibatch"], "does not go with ppo.normalize_values=popart"),

@@ -137,6 +137,7 @@ def test_rows_are_read_piece_by_piece(monkeypatch: pytest.MonkeyPatch) -> None:
         ("Staggered", CriticKind.local, MemoryKind.lstm),
         ("EarlyDeath", CriticKind.poca, MemoryKind.gru),
         ("MateKnows", CriticKind.central, MemoryKind.lstm),
+        ("EarlyDeath", CriticKind.central, MemoryKind.traces),
     ],
 )
 def test_with_a_memory(

@@ -1,4 +1,4 @@
-"""A critic's traces: whose they are, what they average, what is learnt from them, exact resume, refusals."""
+"""Traces of critics and actors: whose they are, what they average, what is learnt, exact resume, refusals."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ from mappo_unity.config.schema import (
     Schedule,
 )
 from mappo_unity.errors import ConfigError
+from mappo_unity.learning.networks.actor_critic import make_actor
+from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout, running_norms
-from mappo_unity.learning.networks.traces import ObservationTraces
+from mappo_unity.learning.networks.traces import ObservationTraces, TracingActor, runs_of
 from mappo_unity.runs import checkpoint
 from mappo_unity.training.setup import set_up
 
@@ -127,7 +129,7 @@ def test_traces_go_on_from_batch_to_batch(probe: str, tmp_path: Path) -> None:
             assert len(at) or probe != "TimeLimit"
 
 
-@pytest.mark.parametrize("memory", [MemoryKind.none, MemoryKind.gru])
+@pytest.mark.parametrize("memory", [MemoryKind.none, MemoryKind.gru, MemoryKind.traces])
 @pytest.mark.parametrize("critic", list(CriticKind))
 @pytest.mark.parametrize("probe", ["Staggered", "EarlyDeath", "TimeLimit"])
 def test_the_first_minibatch_has_ratio_one_and_its_old_values(
@@ -231,10 +233,60 @@ def test_columns_that_are_not_there_are_refused(tmp_path: Path, capsys: pytest.C
 
 def test_a_game_of_images_alone_has_nothing_to_trace() -> None:
     with pytest.raises(ConfigError, match="of which there are none"):
-        ModelConfig(critic_traces=[0.9]).columns_traced(0)
+        ModelConfig(critic_traces=[0.9]).traces_of_critic(0)
 
 
 def test_without_columns_all_are_traced() -> None:
     cfg = ModelConfig(critic_traces=[0.9])
-    assert cfg.columns_traced(3) == [0, 1, 2]
-    assert replace(cfg, critic_traced=[2, 1, 0, 1]).columns_traced(3) == [2, 0]
+    assert cfg.traces_of_critic(3) == ([0.9], [0, 1, 2])
+    assert replace(cfg, critic_traced=[2, 1, 0, 1]).traces_of_critic(3)[1] == [2, 0]
+    assert cfg.traces_of_actor(3) == ([], [])
+
+
+def test_the_critic_remembers_what_the_actor_does_unless_it_is_told_otherwise() -> None:
+    cfg = ModelConfig(memory=MemoryKind.traces, memory_traces=[0.5], memory_traced=[1, 2])
+    assert cfg.traces_of_actor(4) == cfg.traces_of_critic(4) == ([0.5], [1, 2])
+    own = replace(cfg, critic_traces=[0.9])
+    assert own.traces_of_actor(4) == ([0.5], [1, 2]) and own.traces_of_critic(4) == ([0.9], [0, 1, 2, 3])
+    with pytest.raises(ConfigError, match="names column 2; there are 2 columns .* model.memory=none does"):
+        cfg.traces_of_actor(2)
+
+
+@pytest.mark.parametrize("columns", [[], [3], [0, 1, 2], [0, 1, 7, 8, 9, 5], [2, 1, 0]])
+def test_columns_as_runs(columns: list[int]) -> None:
+    runs = runs_of(columns)
+    pairs = zip(runs[::2], runs[1::2])
+    assert [column for first, length in pairs for column in range(first, first + length)] == columns
+    assert runs_of([0, 1, 2, 7]) == [0, 3, 7, 1]
+
+
+# --- the actor
+
+
+def tracing_actor() -> TracingActor:
+    torch.manual_seed(0)
+    cfg = ModelConfig(hidden=[8], memory=MemoryKind.traces, memory_traces=DECAYS)
+    net: Any = make_actor(ObsLayout(3), ActionLayout(1, (2,)), 1, cfg)[0].module
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.normal_()
+    return net
+
+
+def test_an_actor_s_sequence_is_its_decisions_one_by_one() -> None:
+    net = tracing_actor()
+    obs, state = torch.randn(5, 7, 3), torch.randn(5, net.state_size)
+    whole = net.unroll(obs, state)
+    for place in range(7):
+        params, state = net(obs[:, place], state)
+        assert torch.allclose(params, whole[:, place], atol=1e-6)
+
+
+def test_an_actor_hands_on_its_traces_and_acts_by_those_after_the_observation() -> None:
+    net = tracing_actor()
+    obs, state = torch.randn(5, 3), torch.randn(5, net.state_size)
+    params, after = net(obs, state)
+    assert torch.equal(after, net.traces.after(state, obs))
+    assert torch.equal(params, net.actor(obs, after))
+    assert not torch.allclose(params, net(obs, torch.zeros_like(state))[0])
+    assert net.state_size == 8  # two decays, three columns and the 1

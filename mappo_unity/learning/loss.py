@@ -31,8 +31,8 @@ ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: it acted, and the outcome is
 CRITIC_LEARNS = "critic_learns"  # bool [rows, A, 1]: the same, or it departed while a team mate acted
 PROXIMAL = "proximal_log_prob"  # float32 [rows, A, n]: under the policy that the update began with
 BASELINE = "baseline"  # float32 [rows, A, 1]: what a POCA critic said before the update, normalised
-TEAM = "team"  # with memory: the critic's inputs of the whole team, [B, L, A, *]
-MEMBER = "member"  # with memory: int64 [B], the slot of the team whose decisions the sequence holds
+TEAM = "team"  # with recurrent memory: the critic's inputs of the whole team, [B, L, A, *]
+MEMBER = "member"  # with recurrent memory: int64 [B], the slot of the team whose decisions the sequence holds
 MOST_WEIGHT = 100.0  # an importance weight at most (imp_samp_max in Hilton et al.'s code, openai/ppo-ewma)
 BASELINE_WEIGHT = 0.5  # of the baseline's loss beside the value's (ML-Agents, poca/optimizer_torch.py)
 
@@ -89,7 +89,7 @@ class MaskedClipPPOLoss(ClipPPOLoss):
         """Return ``loss_objective``, ``loss_critic`` and ``loss_entropy``, scalars to be added.
 
         Args:
-            rows: team rows ``[R, A]``; with a memory, sequences ``[B, L]`` of single agents.
+            rows: team rows ``[R, A]``; with a recurrent memory, sequences ``[B, L]`` of single agents.
         """
         clip, mask = self.clip_epsilon.item(), rows.get(ACTOR_LEARNS, None)
         dist = self._distribution(rows)
@@ -122,8 +122,12 @@ class MaskedClipPPOLoss(ClipPPOLoss):
 
     def _distribution(self, rows: TensorDictBase) -> ActionDistribution:
         obs = [rows.get(key) for key in self._actor.obs_keys]
-        net = self._actor.module[0].module
-        params = net.unroll(*obs, rows.get(keys.MEMORY)) if self._actor.has_memory else self._policy(*obs)
+        if self._actor.is_recurrent:
+            params = self._actor.module[0].module.unroll(*obs, rows.get(keys.MEMORY))
+        elif self._actor.has_memory:  # of traces: each row has those before it
+            params, _ = self._policy(*obs, rows.get(keys.MEMORY))
+        else:
+            params = self._policy(*obs)
         mask = rows.get(keys.MASK) if self._actor.layout.branches else None
         return ActionDistribution(params, self._actor.layout, mask)
 

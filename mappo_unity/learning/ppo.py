@@ -51,7 +51,7 @@ class PolicyLearner:
     """Everything that learns for one policy name.
 
     Args:
-        actor, critic: see `learning.networks.actor_critic`; both have a memory, or neither.
+        actor, critic: see `learning.networks.actor_critic`; both are recurrent, or neither.
         cfg: the learner's options.
         rewards: the streams that the critic has values for; None: the environment's rewards alone.
         cloning: of demonstrations, beside PPO or alone; None: there are none.
@@ -82,7 +82,7 @@ class PolicyLearner:
         written = [keys.ACTION, keys.LOG_PROB] + [keys.LOG_PROBS] * actor.keeps_components
         self.row_keys = list(dict.fromkeys([*inputs, *written]))
         self.has_baseline = any(isinstance(m, PocaCritic) for m in critic.modules())
-        read = self.row_keys + [keys.FIRST] * actor.has_memory
+        read = self.row_keys + [keys.FIRST] * actor.is_recurrent
         self.carried = CarriedRounds(read, self.has_baseline, channels_first(critic))
         self.rows = make_rows(self.row_keys, critic, cfg)
 

@@ -1,4 +1,4 @@
-"""The rows that an update draws its minibatches from: team rows, or with a memory sequences of one agent."""
+"""The rows that an update draws its minibatches from: team rows, or, if recurrent, sequences of one agent."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def random_order(entry: Tensor, dim: int) -> Tensor:
 
 
 def make_rows(row_keys: list[str], critic: TensorDictModule, cfg: PPOConfig) -> TeamRows | SequenceRows:
-    """Return what an update learns on: sequences where the critic (and so the actor) has a memory."""
+    """Return what an update learns on: sequences where the critic (and so the actor) is recurrent."""
     if not isinstance(critic.module, RecurrentCritic):
         return TeamRows(row_keys, cfg.shuffle_members)
     return SequenceRows(row_keys, [str(key) for key in critic.in_keys], critic.module, cfg)

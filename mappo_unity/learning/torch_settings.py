@@ -41,7 +41,7 @@ def compiled(method: Callable, is_wanted: bool) -> Callable:
 
 def check_compiles(name: str, actor: nn.Module, device: str) -> None:
     """Raise ConfigError where `ppo.compile` cannot compile a policy's networks for its update."""
-    if getattr(actor, "has_memory", False):
+    if getattr(actor, "is_recurrent", False):
         raise ConfigError(
             f"ppo.compile=true does not go with the memory of {name!r}, which is unrolled step by step; "
             f"leave it out, or behaviors.{name}.ppo.compile=false"

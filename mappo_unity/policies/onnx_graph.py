@@ -29,8 +29,9 @@ from mappo_unity.config.packages import PER_MEMBER, ExportError, import_package
 from mappo_unity.learning.networks.actor_critic import Actor, PerMember
 from mappo_unity.learning.networks.encoders import OBS_CLIP
 from mappo_unity.learning.networks.recurrent import RecurrentActor
+from mappo_unity.learning.networks.traces import TracingActor
 from mappo_unity.policies.onnx_actions import BATCH, add_actions
-from mappo_unity.policies.onnx_memory import add_memory
+from mappo_unity.policies.onnx_memory import TRACES, add_memory
 from mappo_unity.policies.onnx_sensors import add_sensors, mirrored_head
 
 FORMAT = 3.0  # ML-Agents' ModelApiVersion.MLAgents2_0: an input for each sensor, actions drawn in the graph
@@ -56,19 +57,19 @@ def build_model(
         ExportError: the onnx package is missing, or the actor has a part that cannot be exported.
     """
     onnx = import_package("onnx")
-    memory = actor.memory if isinstance(actor, RecurrentActor) else None
-    network = _check_network(actor.actor if isinstance(actor, RecurrentActor) else actor)
+    memory = actor if isinstance(actor, RecurrentActor | TracingActor) else None
+    network = _check_network(actor if memory is None else memory.actor)
     graph = Graph(onnx)
     graph.tell("version_number", [FORMAT], [1])
-    graph.tell("memory_size", [float(memory.state_size if memory is not None else 0)], [1])
+    graph.tell("memory_size", [float(0 if memory is None else memory.state_size)], [1])
 
     # The last layer gives all actions at once; the graph has one of its own for each kind.
     *body, head = [*network.net, actor.head] if isinstance(actor, RecurrentActor) else network.net
     if not isinstance(head, nn.Linear):
         raise ExportError(f"the policy network ends in {with_article(type(head).__name__)}, not in a Linear")
     hidden, head = _add_hidden(graph, network, body, head, sensors)
-    if memory is not None:
-        hidden = add_memory(graph, memory, hidden, BATCH)
+    if isinstance(actor, RecurrentActor):
+        hidden = add_memory(graph, actor.memory, hidden, BATCH)
     add_actions(graph, hidden, head, network)
 
     model = onnx.helper.make_model(
@@ -78,11 +79,18 @@ def build_model(
         ir_version=IR_VERSION,
         opset_imports=[onnx.helper.make_opsetid("", OPSET)],
     )
-    mirror = {} if network.mirror is None else {MIRROR: json.dumps(network.mirror.options)}
-    onnx.helper.set_model_props(model, {"behavior_name": name, **(metadata or {}), **mirror})
+    onnx.helper.set_model_props(model, {"behavior_name": name, **(metadata or {}), **_own_parts(network)})
     onnx.checker.check_model(model, full_check=True)
 
     return model
+
+
+def _own_parts(network: Actor) -> dict[str, str]:
+    """Return what the metadata tells of parts that ML-Agents' networks do not have."""
+    parts: dict[str, Any] = {} if network.mirror is None else {MIRROR: network.mirror.options}
+    if network.encoder.traces is not None:
+        parts[TRACES] = network.encoder.traces.options
+    return {name: json.dumps(part) for name, part in parts.items()}
 
 
 def _add_hidden(

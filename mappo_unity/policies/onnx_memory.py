@@ -4,18 +4,23 @@
     outputs  recurrent_out  float32 [batch, 1, M]
 
 An LSTM is one operator, and its state lies as in ML-Agents' files: the hidden state, then the cell state.
-A GRU, which Unity's inference does not import, is made of operators that it does.
+A GRU, which Unity's inference does not import, is made of operators that it does; so are traces.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from mappo_unity.learning.networks.encoders import OBS_CLIP, Encoder, RunningNorm, running_norms
 from mappo_unity.learning.networks.recurrent import Memory
+from mappo_unity.learning.networks.traces import ObservationTraces
 
+TRACES = "traces"
+"""The name of what a network takes of its traces; in the metadata: their decays and columns, as JSON."""
 TO_END = 2**63 - 1  # the end of a slice that goes as far as there is anything
 
 
@@ -84,3 +89,52 @@ def _gru(graph: Any, memory: Memory, features: str, state: str) -> str:
     after = graph.node("Add", [new, kept_part])
     graph.node("Unsqueeze", [after], "recurrent_out", axes=[1])
     return after
+
+
+def add_traces(graph: Any, encoder: Encoder, vectors: str, batch: str) -> str:
+    """Add an encoder's traces to a graph; return the name of what the network takes of them ``[batch, M]``.
+
+    Args:
+        graph: an `onnx_graph.Graph`.
+        encoder: the module, which has traces.
+        vectors: the name of all vector observations ``[batch, O]``, as they are seen.
+        batch: the name of the batch dimension.
+    """
+    net = encoder.traces
+    assert net is not None
+    state = graph.node("Squeeze", [graph.input("recurrent_in", [1, net.size])], axes=[1])
+    width = len(net.columns)
+
+    # (1 - decay) * [x, 1], of each decay: the column that stands for the 1 is taken times 0
+    given = net.decays.new_ones(len(net.decays), width + 1) - net.decays
+    scale, shift = given.clone(), torch.zeros_like(given)
+    scale[:, -1], shift[:, -1] = 0.0, given[:, -1]
+    columns = torch.cat([net.columns, net.columns[:1]]).repeat(len(net.decays))
+
+    def row(name: str, values: Tensor) -> str:
+        return graph.constant(f"traces.{name}", values.reshape(1, -1))
+
+    seen = graph.node("Gather", [vectors, graph.constant("traces.columns", columns, np.int64)], axis=1)
+    seen = graph.node("Add", [graph.node("Mul", [seen, row("scale", scale)]), row("shift", shift)])
+    kept = graph.node("Mul", [state, row("decay", net.decays.expand_as(given))])
+    norms = running_norms(encoder.norm)
+    after = graph.node("Add", [kept, seen], f"{TRACES}.after" if norms else TRACES)
+    graph.node("Unsqueeze", [after], "recurrent_out", axes=[1])
+    graph.output("recurrent_out", [batch, 1, net.size])
+    return _normalised_traces(graph, norms[0], net, after) if norms else after
+
+
+def _normalised_traces(graph: Any, norm: RunningNorm, net: ObservationTraces, after: str) -> str:
+    """Add `ObservationTraces.forward`, clipped, decay by decay."""
+    width, parts = len(net.columns), []
+    mean = graph.constant("traces.mean", norm.mean[net.columns].unsqueeze(0))
+    inv_std = graph.constant("traces.inv_std", norm.inv_std[net.columns].unsqueeze(0))
+
+    def cut(first: int, end: int) -> str:
+        return graph.node("Slice", [after], axes=[1], starts=[first], ends=[end])
+
+    for first in range(0, net.size, width + 1):
+        share = cut(first + width, first + width + 1)
+        shifted = graph.node("Sub", [cut(first, first + width), graph.node("Mul", [share, mean])])
+        parts += [graph.node("Mul", [shifted, inv_std]), share]
+    return graph.node("Clip", [graph.node("Concat", parts, axis=1)], TRACES, min=-OBS_CLIP, max=OBS_CLIP)

@@ -12,6 +12,8 @@ from torch import nn
 from mappo_unity.learning.networks.attention import ABSENT, HEADS, EntityEncoder, ResidualSelfAttention
 from mappo_unity.learning.networks.encoders import Encoder
 from mappo_unity.learning.networks.mirror import Mirror
+from mappo_unity.policies.onnx_actions import BATCH
+from mappo_unity.policies.onnx_memory import add_traces
 
 
 def add_sensors(
@@ -55,6 +57,8 @@ def add_sensors(
             views.append(_vector_image(graph, views[0], mirror))
         for features, view in zip(sides, views):
             features.insert(0, graph.layer(encoder.norm, view, "norm"))
+        if encoder.traces is not None:  # which a mirrored network does not have
+            sides[0].insert(1, add_traces(graph, encoder, views[0], BATCH))
 
     return [_with_entities(graph, encoder, _joined(graph, features), sets) for features in sides]
 

@@ -111,11 +111,11 @@ def check_learners(cfg: Config, env: Played, learners: Mapping[str, PolicyLearne
 
 
 def check_columns(name: str, obs: ObsLayout, layout: ActionLayout, model: ModelConfig) -> None:
-    """Raise ConfigError, naming the policy, where `model.mirror` or `model.critic_traces` does not fit it."""
+    """Raise ConfigError, naming the policy, where `model.mirror` or traces do not fit it."""
     try:
         make_mirror(model.mirror, obs, layout)
-        if model.critic_traces:
-            model.columns_traced(obs.vector)
+        model.traces_of_actor(obs.vector)
+        model.traces_of_critic(obs.vector)
     except ConfigError as error:
         raise ConfigError(f"{error} ({name})") from error
 

@@ -7,6 +7,7 @@ so that ``--help`` and errors about options come at once.
 from mappo_unity.config.schema.collect import CollectConfig, Engine
 from mappo_unity.config.schema.env import BACKENDS, Backend, EnvConfig
 from mappo_unity.config.schema.log import LogConfig, LoggerKind, TagKind
+from mappo_unity.config.schema.mirror import MirrorConfig, show_mirror, show_numbers
 from mappo_unity.config.schema.model import (
     LOG_STD_RANGE,
     Activation,
@@ -15,12 +16,9 @@ from mappo_unity.config.schema.model import (
     GoalKind,
     ImageKind,
     MemoryKind,
-    MirrorConfig,
     ModelConfig,
     WeightInit,
     bounded_log_std,
-    show_mirror,
-    show_numbers,
 )
 from mappo_unity.config.schema.pages import PlotConfig, ReportConfig, XAxis
 from mappo_unity.config.schema.policies import (

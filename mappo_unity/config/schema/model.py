@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Optional
+from typing import Optional
 
 from mappo_unity.config.schema.checks import at_least, between, widths, within
+from mappo_unity.config.schema.mirror import WITHOUT_MIRROR, MirrorConfig, show_numbers
 from mappo_unity.errors import ConfigError
 
 
@@ -35,6 +36,7 @@ class MemoryKind(Enum):
     none = "none"
     lstm = "lstm"
     gru = "gru"
+    traces = "traces"
 
 
 class ImageKind(Enum):
@@ -79,81 +81,6 @@ def bounded_log_std(value: float) -> float:
     return min(max(value, LOG_STD_RANGE[0]), LOG_STD_RANGE[1])
 
 
-WITHOUT_MIRROR = "model.mirror.use=false does without"
-"""What to do where networks cannot mirror."""
-
-
-@dataclass
-class MirrorConfig:
-    """What an agent senses and does, in a mirror that exchanges left and right; with nothing given: unused.
-
-    Columns are those of the vector observations, all sensors in one, counted from 0. Where a network mirrors,
-    it acts in the mirror image of a situation as the mirror image of how it acts in that situation.
-    """
-
-    use: bool = True
-    """Whether networks mirror, where a mirror image is described; false: presets' descriptions are left
-    aside."""
-    rays: list[int] = field(default_factory=list)
-    """Ray sensors of Unity, four numbers each: first column, rays, numbers of a ray (tags + 2), stacked
-    frames; rays to the right and to the left change places."""
-    swap: list[int] = field(default_factory=list)
-    """Runs of columns that change places, three numbers each: first column of the one, first column of the
-    other, length."""
-    negate: list[int] = field(default_factory=list)
-    """Columns that change their sign; of two that change places, both."""
-    flip_images: bool = False
-    """Images and grids have a mirror image, too: their columns of pixels or cells in reverse order."""
-    swap_actions: list[int] = field(default_factory=list)
-    """Continuous actions that change places, two numbers each."""
-    negate_actions: list[int] = field(default_factory=list)
-    """Continuous actions that change their sign; of two that change places, both."""
-    branches: list[int] = field(default_factory=list)
-    """Of each discrete action the one that takes its place, branch after branch: [0, 2, 1] for a branch of
-    none, left, right; no numbers: all stay."""
-
-    def __post_init__(self) -> None:
-        for name, group in (("rays", 4), ("swap", 3), ("swap_actions", 2)):
-            numbers = getattr(self, name)
-            if len(numbers) % group:
-                raise ConfigError(
-                    f"model.mirror.{name}={show_numbers(numbers)} holds {len(numbers)} numbers; it takes "
-                    f"{group} for each entry"
-                )
-        for name, numbers in self.lists().items():
-            if any(number < 0 for number in numbers):
-                raise ConfigError(f"model.mirror.{name}={show_numbers(numbers)} must hold numbers from 0 on")
-
-    def lists(self) -> dict[str, list[int]]:
-        """Return the options that are lists of numbers, by their names."""
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {name: value for name, value in values.items() if isinstance(value, list)}
-
-    @property
-    def is_used(self) -> bool:
-        """Whether there is a mirror image."""
-        return self.use and (self.flip_images or any(self.lists().values()))
-
-    @property
-    def in_effect(self) -> MirrorConfig:
-        """What of it matters: itself, or nothing where it is not used."""
-        return self if self.is_used else MirrorConfig()
-
-
-def show_mirror(options: dict[str, Any]) -> str:
-    """Return what is given of `MirrorConfig`, which stands there as plain values, in a few words."""
-    mirror = asdict(MirrorConfig(**options).in_effect)
-    given = {name: value for name, value in mirror.items() if value and name != "use"}
-    shown = (f"{name}={'true' if value is True else show_numbers(value)}" for name, value in given.items())
-    return f"({' '.join(shown)})" if given else "none"
-
-
-def show_numbers(numbers: list[int]) -> str:
-    """Return numbers as they are given; of many the first ones."""
-    shown = ", ".join(map(str, numbers[:8]))
-    return f"[{shown}, ...]" if len(numbers) > 8 else f"[{shown}]"
-
-
 @dataclass
 class ModelConfig:
     """The actor's and the critic's networks."""
@@ -194,13 +121,20 @@ class ModelConfig:
     """Sensors that are goal signals: observations like others (none), and, as ML-Agents' default has it, what
     another network makes the weights of the last hidden layer of (hyper; actors and local critics)."""
     memory: MemoryKind = MemoryKind.none
-    """Memory of the actor and the critic: lstm or gru, one layer before the heads; none: they see the newest
-    observation only."""
+    """Memory of the actor and the critic: lstm or gru, one layer before the heads, which is learnt on
+    sequences; traces, moving averages of what the agent has observed, where nothing is; none: they see the
+    newest observation only."""
     memory_size: int = 128
     """Width of the memory's state (as in ML-Agents: an LSTM's hidden and cell state are half as wide)."""
+    memory_traces: list[float] = field(default_factory=lambda: [0.8, 0.95])
+    """With model.memory=traces: decays, between 0 and 1, of the moving averages of the agent's vector
+    observations over its episode; 0.95 averages about 20 decisions."""
+    memory_traced: list[int] = field(default_factory=list)
+    """Columns of the vector observations, all sensors in one, that model.memory_traces averages: runs, of two
+    numbers each, first column and length; none: all."""
     critic_traces: list[float] = field(default_factory=list)
     """Let the critic remember: decays, between 0 and 1, of moving averages of each agent's vector
-    observations over its episode, such as [0.8, 0.95]; none: it sees the newest ones alone."""
+    observations over its episode, such as [0.8, 0.95]; none: those of the actor, if it has any."""
     critic_traced: list[int] = field(default_factory=list)
     """Columns of the vector observations, all sensors in one, that model.critic_traces averages: runs, of two
     numbers each, first column and length; none: all."""
@@ -231,43 +165,64 @@ class ModelConfig:
                 "model.critic=poca needs model.share_parameters=true: its value is the whole team's"
             )
 
-        self._check_traced()
+        self._check_traces()
         if self.mirror.is_used:
             self._check_mirrored()
 
         within("model.init_log_std", self.init_log_std, *LOG_STD_RANGE)
 
-    def columns_traced(self, vector: int) -> list[int]:
-        """Return the columns that `critic_traces` averages, of `vector` columns.
+    @property
+    def is_recurrent(self) -> bool:
+        """Whether the memory is a layer that is learnt on sequences."""
+        return self.memory in (MemoryKind.lstm, MemoryKind.gru)
+
+    def traces_of_actor(self, vector: int) -> tuple[list[float], list[int]]:
+        """Return the decays of what the actor averages, and the columns, of `vector` columns; none: nothing.
 
         Raises:
             ConfigError: they have no such column, or there are none.
         """
-        begins, lengths = self.critic_traced[::2], self.critic_traced[1::2]
-        runs = list(zip(begins, lengths)) or [(0, vector)]
+        if self.memory is not MemoryKind.traces:
+            return [], []
+        return self.memory_traces, self._columns("memory", vector, "model.memory=none")
+
+    def traces_of_critic(self, vector: int) -> tuple[list[float], list[int]]:
+        """Return the same of the critic; raises ConfigError likewise."""
+        if not self.critic_traces:
+            return self.traces_of_actor(vector)
+        return self.critic_traces, self._columns("critic", vector, "model.critic_traces=[]")
+
+    def _columns(self, whose: str, vector: int, without: str) -> list[int]:
+        numbers: list[int] = getattr(self, f"{whose}_traced")
+        runs = list(zip(numbers[::2], numbers[1::2])) or [(0, vector)]
         columns = [column for begin, length in runs for column in range(begin, begin + length)]
         if not vector:
             raise ConfigError(
-                f"model.critic_traces={list(self.critic_traces)} averages vector observations, of which "
-                "there are none; give model.critic_traces=[]"
+                f"model.{whose}_traces={list(getattr(self, f'{whose}_traces'))} averages vector "
+                f"observations, of which there are none; give {without}"
             )
         if max(columns) >= vector:
             raise ConfigError(
-                f"model.critic_traced={show_numbers(self.critic_traced)} names column {max(columns)}; there "
-                f"are {vector} columns of vector observations, counted from 0; model.critic_traces=[] does "
-                "without"
+                f"model.{whose}_traced={show_numbers(numbers)} names column {max(columns)}; there are "
+                f"{vector} columns of vector observations, counted from 0; {without} does without"
             )
         return columns
 
-    def _check_traced(self) -> None:
-        for decay in self.critic_traces:
-            between("model.critic_traces", decay, 0, 1)
+    def _check_traces(self) -> None:
+        for whose in ("memory", "critic"):
+            for decay in getattr(self, f"{whose}_traces"):
+                between(f"model.{whose}_traces", decay, 0, 1)
 
-        numbers = self.critic_traced
-        if len(numbers) % 2 or any(n < 0 for n in numbers[::2]) or any(n < 1 for n in numbers[1::2]):
+            numbers: list[int] = getattr(self, f"{whose}_traced")
+            if len(numbers) % 2 or any(n < 0 for n in numbers[::2]) or any(n < 1 for n in numbers[1::2]):
+                raise ConfigError(
+                    f"model.{whose}_traced={show_numbers(numbers)} must hold runs of columns, two numbers "
+                    "each: the first column, from 0 on, and how many, from 1 on"
+                )
+        if self.memory is MemoryKind.traces and not self.memory_traces:
             raise ConfigError(
-                f"model.critic_traced={show_numbers(numbers)} must hold runs of columns, two numbers each: "
-                "the first column, from 0 on, and how many, from 1 on"
+                "model.memory_traces=[] leaves nothing to model.memory=traces; give decays, such as "
+                "[0.8, 0.95], or model.memory=none"
             )
 
     def _check_mirrored(self) -> None:

@@ -28,7 +28,7 @@ class Cloning:
         actor: learns.
         expert: what it learns from.
         cfg: strength, and whether nothing else teaches the actor.
-        ppo: epochs, minibatches, the optimizer's kind and weight decay and, with a memory, the length of
+        ppo: epochs, minibatches, the optimizer's kind and weight decay and, if it is recurrent, the length of
             sequences.
         max_steps: agent decisions of the run.
     """
@@ -40,7 +40,7 @@ class Cloning:
         self._max_steps = max_steps
         # epsilon stays torch's, as in ML-Agents
         self.optimizer = kind_of(ppo)(actor.parameters(), lr=ppo.lr, weight_decay=ppo.weight_decay)
-        self._pieces = _cut(expert.first, ppo.sequence_length if actor.has_memory else 1)
+        self._pieces = _cut(expert.first, ppo.sequence_length if actor.is_recurrent else 1)
 
     def learn(self, decisions: int, lr: float, progress: float) -> dict[str, float]:
         """Clone, as often as PPO learns from a batch; return metrics.

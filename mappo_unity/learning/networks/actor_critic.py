@@ -26,6 +26,7 @@ from mappo_unity.learning.networks.mirror import MirroredCritic, make_mirror
 from mappo_unity.learning.networks.mlp import apply_options, init_head, make_mlp
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import RecurrentActor, RecurrentCritic, output_size
+from mappo_unity.learning.networks.traces import TracingActor
 
 
 class Actor(nn.Module):
@@ -129,14 +130,15 @@ class UnityActor(ProbabilisticActor):
         obs_keys: the entries that it reads, in its order.
         layout: the sizes of an action.
 
-    Attributes: `keeps_components`, whether draws hold the log-probabilities of an action's components, too;
+    Attributes: `memory_size`, M, 0 without a memory; `is_recurrent`, whether that is learnt on sequences;
+    `keeps_components`, whether draws hold the log-probabilities of an action's components, too;
     `moving_norms`, the normalisers whose statistics move while a batch is collected.
     """
 
     def __init__(self, net: nn.Module, obs_keys: Sequence[str], layout: ActionLayout) -> None:
         in_keys = {"params": "params"} | ({"mask": keys.MASK} if layout.branches else {})
-        memory = net.memory if isinstance(net, RecurrentActor) else None
-        state = ([keys.MEMORY], [keys.MEMORY_AFTER]) if memory is not None else ([], [])
+        memory_size = net.state_size if isinstance(net, RecurrentActor | TracingActor) else 0
+        state = ([keys.MEMORY], [keys.MEMORY_AFTER]) if memory_size else ([], [])
         super().__init__(
             TensorDictModule(net, in_keys=[*obs_keys, *state[0]], out_keys=["params", *state[1]]),
             in_keys=in_keys,
@@ -148,7 +150,7 @@ class UnityActor(ProbabilisticActor):
             default_interaction_type=InteractionType.RANDOM,
         )
         self.obs_keys, self.layout = list(obs_keys), layout
-        self.memory_size: int = 0 if memory is None else memory.state_size
+        self.memory_size, self.is_recurrent = memory_size, isinstance(net, RecurrentActor)
         self.keeps_components = False
         self.moving_norms: list[RunningNorm] = []
 
@@ -191,10 +193,12 @@ def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelC
     layout = replace(layout, squashed=squashed)
 
     if cfg.share_parameters or team_size == 1:
-        net: nn.Module = Actor(obs, layout, cfg)
-        if cfg.memory is not MemoryKind.none:
+        net: nn.Module = Actor(_with_traces(obs, *cfg.traces_of_actor(obs.vector)), layout, cfg)
+        if cfg.is_recurrent:
             net = RecurrentActor(net, cfg)
             init_head(net.head, cfg, layout.num_means)
+        elif cfg.memory is MemoryKind.traces:
+            net = TracingActor(net)
     else:
         net = PerMember([Actor(obs, layout, cfg) for _ in range(team_size)], obs.team_dims)
     return UnityActor(net, obs.keys, layout)
@@ -212,14 +216,13 @@ def make_critic(
         layout: the sizes of an action, which MA-POCA's baseline reads.
         streams: reward streams V, which have a value each.
     """
-    if cfg.critic_traces:
-        obs = replace(obs, traces=tuple(cfg.critic_traces), traced=tuple(cfg.columns_traced(obs.vector)))
+    obs = _with_traces(obs, *cfg.traces_of_critic(obs.vector))
     local = team_size == 1 or cfg.critic is CriticKind.local
     in_keys = list(obs.keys) if local else [*obs.keys, keys.PRESENT, keys.DEPARTED]
 
     if cfg.share_parameters or team_size == 1:
         net = _critic(obs, team_size, cfg, layout, streams)
-        if cfg.memory is not MemoryKind.none:
+        if cfg.is_recurrent:
             net = RecurrentCritic(net, cfg, sees_team=not local)
             init_head(net.value_heads[0], cfg)
     else:
@@ -239,13 +242,16 @@ def _critic(
     elif cfg.critic is not CriticKind.poca:
         net = PooledCritic(obs, team_size, cfg, streams)
     else:
-        has_memory = cfg.memory is not MemoryKind.none
-        head_size = output_size(cfg.memory, cfg.memory_size) if has_memory else None
+        head_size = output_size(cfg.memory, cfg.memory_size) if cfg.is_recurrent else None
         net = PocaCritic(obs, layout, team_size, cfg, head_size, streams)
 
     mirror = make_mirror(cfg.mirror, obs, layout)
     net = apply_options(net, cfg)
     return net if mirror is None else MirroredCritic(net, mirror)
+
+
+def _with_traces(obs: ObsLayout, decays: Sequence[float], columns: Sequence[int]) -> ObsLayout:
+    return replace(obs, traces=tuple(decays), traced=tuple(columns))
 
 
 def value_layers(critic: TensorDictModule) -> list[nn.Linear]:

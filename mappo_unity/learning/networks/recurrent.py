@@ -101,6 +101,11 @@ class RecurrentActor(nn.Module):
         self.memory = Memory(last.in_features, cfg.memory, cfg.memory_size)
         self.head = linear(self.memory.size, last.out_features, 0.01)
 
+    @property
+    def state_size(self) -> int:
+        """The width M of its state."""
+        return self.memory.state_size
+
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return distribution parameters ``[..., P]`` and the states ``[..., M]`` after this decision.
 

@@ -13,6 +13,7 @@ from mappo_unity.config.packages import import_package
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
 from mappo_unity.learning.networks.recurrent import RecurrentActor
+from mappo_unity.learning.networks.traces import TracingActor
 from mappo_unity.policies.onnx_policy import fit_image, open_session
 from mappo_unity.policies.warm_start.onnx_network import OnnxNetwork
 
@@ -31,20 +32,20 @@ def check_agreement(network: OnnxNetwork, net: Any, sensors: Sequence[Sequence[i
         ConfigError: they differ by more than `TOLERANCE`: the file was misread.
     """
     rng = np.random.default_rng(0)
-    recurrent = isinstance(net, RecurrentActor)
-    actor: Any = net.actor if recurrent else net
+    remembers = isinstance(net, RecurrentActor | TracingActor)
+    actor: Any = net.actor if remembers else net
     feed, inputs = _random_inputs(network, actor.encoder, sensors, rng)
-    if recurrent:
-        feed["recurrent_in"] = rng.normal(0, 0.5, (CHECKED_ROWS, 1, net.memory.state_size)).astype(np.float32)
+    if remembers:
+        feed["recurrent_in"] = rng.normal(0, 0.5, (CHECKED_ROWS, 1, net.state_size)).astype(np.float32)
         inputs.append(torch.from_numpy(feed["recurrent_in"][:, 0]))
 
     device = next(net.parameters()).device
     out = net(*(value.to(device) for value in inputs))
-    params = (out[0] if recurrent else out).cpu()
+    params = (out[0] if remembers else out).cpu()
     found = _run(network, feed)
 
     errors = []
-    if recurrent:
+    if remembers:
         errors.append(float(np.abs(found.pop().reshape(CHECKED_ROWS, -1) - out[1].cpu().numpy()).max()))
     error = max(errors + _differences(found, params, actor.layout))
     if not error <= TOLERANCE:  # so that nan does not pass

@@ -12,8 +12,9 @@ from mappo_unity.config.schema import LOG_STD_RANGE
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder
 from mappo_unity.learning.networks.recurrent import RecurrentActor
+from mappo_unity.learning.networks.traces import TracingActor
 from mappo_unity.policies.warm_start.onnx_network import OnnxNetwork
-from mappo_unity.policies.warm_start.sensors import Part
+from mappo_unity.policies.warm_start.sensors import STATE, Part
 
 ASSUMED_COUNT = 1e6
 """Observations that a file's normaliser counts as having seen: the file does not tell. So many are moved
@@ -34,12 +35,12 @@ def actor_tensors(
 
     Args:
         network: of the file.
-        net: `Actor` or `RecurrentActor`, of the same shape where everything is to fit.
+        net: `Actor`, `RecurrentActor` or `TracingActor`, of the same shape where everything is to fit.
         sensors: shapes of the behavior's sensors.
     """
     recurrent = isinstance(net, RecurrentActor)
-    actor: Any = net.actor if isinstance(net, RecurrentActor) else net
-    prefix = "actor." if recurrent else ""
+    actor: Any = net.actor if isinstance(net, RecurrentActor | TracingActor) else net
+    prefix = "" if actor is net else "actor."
     out: dict[str, np.ndarray] = {}
     misfits: dict[str, str] = {}
 
@@ -64,7 +65,7 @@ def actor_tensors(
 
     if recurrent and network.state is not None:
         out |= {f"memory.layer.{name}": values for name, values in network.state.weights.items()}
-    head = "head" if recurrent else f"net.{2 * len(network.layers)}"
+    head = "head" if recurrent else f"{prefix}net.{2 * len(network.layers)}"
     try:
         out |= {
             n.format(head=head, prefix=prefix): v for n, v in _action_tensors(network, actor.layout).items()
@@ -118,6 +119,10 @@ def _columns(network: OnnxNetwork, encoder: Encoder, sensors: Sequence[Sequence[
             if width != net.out[0].out_features:
                 raise Misfit(f"{part.input} has {width} features, here {net.out[0].out_features}")
             start = _image_starts(encoder)[place]
+        elif part.input == STATE:
+            start = encoder.vector
+            if encoder.traces is None or encoder.traces.size != width:
+                raise Misfit(f"its traces are {width} numbers, here {getattr(encoder.traces, 'size', 0)}")
         else:
             start = part.start + _vector_start(network, part, sensors, starts)
         out.append(np.arange(start, start + width))
@@ -144,9 +149,10 @@ def _vector_start(
 
 
 def _image_starts(encoder: Encoder) -> list[int]:
-    """Return where the features of each image begin, behind the vectors."""
+    """Return where the features of each image begin, behind the vectors and their traces."""
     sizes = [net.out[0].out_features for net in encoder.images]  # type: ignore[union-attr, index]
-    return [encoder.vector + sum(sizes[:place]) for place in range(len(sizes))]
+    first = encoder.vector + (0 if encoder.traces is None else encoder.traces.size)
+    return [first + sum(sizes[:place]) for place in range(len(sizes))]
 
 
 def _image_place(part: Part, images: Sequence[int]) -> int:

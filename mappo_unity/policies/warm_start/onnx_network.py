@@ -59,11 +59,10 @@ class OnnxNetwork:
             "hidden": [len(layer.linear.bias) for layer in self.layers],
             "activation": self.layers[0].activation,
             "layer_norm": self.layers[0].norm is not None,
-            "memory": "none" if self.state is None else self.state.kind,
+            "memory": "none",
             "mirror": self.mirror,
         }
-        if self.state is not None:
-            out["memory_size"] = self.state.memory_size
+        out |= {} if self.state is None else self.state.options
 
         # the rest only where the file has what it is about, in the order in which it is shown
         if any(part.image is None for part in self.parts):

@@ -8,8 +8,10 @@ import numpy as np
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.networks.encoders import OBS_CLIP
+from mappo_unity.policies.onnx_memory import TRACES
 from mappo_unity.policies.warm_start.graph import SAME_NUMBERS, Linear, OnnxGraph
 
+STATE = "recurrent_in"
 _COPIES = ("Identity", "Dropout", "Cast")
 _OF_IMAGES = (*SAME_NUMBERS, "Conv", "MaxPool", "Add", "Mul", "Sigmoid", "Relu", "LeakyRelu")
 """Operators between an image and its linear layer."""
@@ -58,7 +60,7 @@ class Image(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Columns of what the first hidden layer takes: some of an input's, or an image's features."""
+    """Columns of what the first hidden layer takes: some of an input's, an image's features, or traces."""
 
     input: str
     start: int
@@ -75,6 +77,8 @@ def read_parts(graph: OnnxGraph, name: str) -> tuple[list[Part], tuple[np.ndarra
         ConfigError: sensors go through something that networks here do not have.
     """
     name = graph.through(name, _COPIES)
+    if name == TRACES and TRACES in graph.metadata:
+        return [Part(STATE, 0, graph.inputs[STATE][-1])], None
 
     normed = graph.layer_norm(name)
     if normed is not None:

@@ -1,20 +1,25 @@
-"""The memory in an ONNX file: an LSTM, as ML-Agents and we write it, or our GRU."""
+"""The memory in an ONNX file: an LSTM, as ML-Agents and we write it, or our GRU and traces."""
 
 from __future__ import annotations
 
+import json
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mappo_unity.errors import ConfigError
+from mappo_unity.policies.onnx_memory import TRACES
 from mappo_unity.policies.warm_start.graph import OnnxGraph
 
 
 class State(NamedTuple):
-    """A recurrent layer: its weights are those of torch's layer, by their names there."""
+    """A memory.
 
-    kind: str  # lstm or gru
-    memory_size: int
+    Attributes: `options`, what makes one of its kind and size; `weights`, those of torch's layer, by their
+    names there; `features`, what goes into it, or, of traces, the last hidden layer's output.
+    """
+
+    options: dict[str, Any]
     weights: dict[str, np.ndarray]
     features: str
 
@@ -30,12 +35,16 @@ def read_state(graph: OnnxGraph, hidden: str) -> State | None:
         return _lstm(graph, graph.node(hidden))
     if "recurrent_in" not in graph.inputs:
         return None
+    if TRACES in graph.metadata:
+        own = json.loads(graph.metadata[TRACES])
+        options = {"memory": "traces", "memory_traces": own["decays"], "memory_traced": own["columns"]}
+        return State(options, {}, hidden)
 
     gru = _gru(graph, hidden)
     if gru is None:
         raise ConfigError(
             f"{graph.path}: its memory comes from {graph.op(hidden) or 'nothing'}; an LSTM before the action "
-            "layers can be read, and a GRU as mappo-export writes it"
+            "layers can be read, and a GRU or traces as mappo-export writes them"
         )
     return gru
 
@@ -50,7 +59,7 @@ def _lstm(graph: OnnxGraph, node: Any) -> State:
     names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
     arrays = (given, kept, biases[: 4 * size], biases[4 * size :])
     weights = {name: _ifco(array, size) for name, array in zip(names, arrays)}
-    return State("lstm", 2 * size, weights, node.input[0])
+    return State({"memory": "lstm", "memory_size": 2 * size}, weights, node.input[0])
 
 
 def _ifco(values: np.ndarray, size: int) -> np.ndarray:
@@ -87,4 +96,5 @@ def _gru(graph: OnnxGraph, hidden: str) -> State | None:
         for column, side in enumerate(("ih", "hh"))
         for kind in ("weight", "bias")
     }
-    return State("gru", weights["weight_hh_l0"].shape[1], weights, pairs[0][0].x)
+    size = weights["weight_hh_l0"].shape[1]
+    return State({"memory": "gru", "memory_size": size}, weights, pairs[0][0].x)
