@@ -32,7 +32,7 @@ from mappo_unity.training.trainer import train
 CASES = (
     "env=3DBall",
     "env=SoccerTwos",
-    "env=Hallway",
+    "env=Hallway model.memory=lstm",
     "env=CooperativePushBlock",
     "env=GridFoodCollector",
     "env=3DBall model.hidden=[1024,1024]",
