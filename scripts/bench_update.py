@@ -29,9 +29,11 @@ from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
 from mappo_unity.training.setup import set_up
 
+OPTIONS = {"Hallway": ["model.memory=lstm"]}
+
 
 def main() -> None:
-    """Measure each scene's preset and print a line for it."""
+    """Measure each scene's preset (Hallway's with an LSTM) and print a line for it."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -41,7 +43,8 @@ def main() -> None:
 
     print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores, one torch thread")
     for scene in arguments.scenes:
-        measure(compose_config([f"env={scene}", "update_threads=1"]).config, arguments.repeats)
+        lines = [f"env={scene}", "update_threads=1", *OPTIONS.get(scene, [])]
+        measure(compose_config(lines).config, arguments.repeats)
 
 
 def measure(cfg: Config, repeats: int) -> None:

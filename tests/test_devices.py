@@ -52,7 +52,7 @@ RUNS = {
         ],
         96,
     ),
-    "Hallway": (["env=Hallway", "env.num_areas=2", "ppo.sequence_length=4"], 48),
+    "Hallway": (["env=Hallway", "env.num_areas=2"], 48),
     "DungeonEscape": (ROOM, 72),
     "workers": ([*BALL, "collect.workers=2", "collect.engine=local"], 96),
     "remembering": ([*ROOM, "model.memory=gru", "ppo.sequence_length=4"], 72),

@@ -328,7 +328,7 @@ SMALL += ["rewards.curiosity.hidden=[16]", "rewards.rnd.hidden=[16]"]
     "line",
     [
         ["env=3DBall"],
-        ["env=Hallway", "model.memory_size=8", "env.num_areas=4"],
+        ["env=Hallway", "env.num_areas=4"],
         ["env=SoccerTwos", "model.critic=poca", "env.num_areas=2", "matches.interval=null"],
         ["env=GridFoodCollector", "env.num_areas=1"],
         ["env=DungeonEscape", "model.critic=poca", "model.memory=gru", "env.num_areas=4"],

@@ -59,8 +59,9 @@ def test_another_precision_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_compiled_update_is_the_same_to_rounding(tmp_path: Path) -> None:
-    lines = [*LINES, "ppo.minibatch_size=16", "ppo.epochs=2", "seed=3"]
+@pytest.mark.parametrize("memory", ["none", "traces"])
+def test_a_compiled_update_is_the_same_to_rounding(memory: str, tmp_path: Path) -> None:
+    lines = [*LINES, "ppo.minibatch_size=16", "ppo.epochs=2", "seed=3", f"model.memory={memory}"]
     parameters = []
     for compile_ in ("false", "true"):
         with set_up(options(*lines, f"ppo.compile={compile_}"), tmp_path / compile_) as setup:
@@ -77,8 +78,8 @@ def test_a_compiled_update_is_the_same_to_rounding(tmp_path: Path) -> None:
 
 
 def test_memories_are_not_compiled(tmp_path: Path, capsys: Any) -> None:
-    lines = ["env=Hallway", "env.num_areas=2", "ppo.compile=true", f"hydra.run.dir={tmp_path}", *SMALL]
-    assert train_main(lines) == 2
+    lines = ["env=Hallway", "env.num_areas=2", "ppo.compile=true", "model.memory=gru", *SMALL]
+    assert train_main([*lines, f"hydra.run.dir={tmp_path}"]) == 2
     assert "ppo.compile=true does not go with the memory of 'Hallway'" in capsys.readouterr().err
 
 
