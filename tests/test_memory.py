@@ -196,7 +196,12 @@ def share_right(batch: Any) -> float:
         ("TeamRecall", 44, 200, {"memory": MemoryKind.lstm, "critic": CriticKind.central}),
         ("TeamRecall", 44, 200, {"memory": MemoryKind.lstm, "critic": CriticKind.poca}),
         ("Recall", 44, 200, {"memory": MemoryKind.traces}),
-        ("LongRecall", 122, 600, {"memory": MemoryKind.traces, "memory_traces": [0.8, 0.98]}),
+        (
+            "LongRecall",
+            122,
+            600,
+            {"memory": MemoryKind.traces, "memory_traces": [0.98], "normalize_obs": True},
+        ),
         ("StaggeredRecall", 124, 200, {"memory": MemoryKind.traces}),
         ("TeamRecall", 44, 200, {"memory": MemoryKind.traces, "critic": CriticKind.central}),
         ("TeamRecall", 44, 200, {"memory": MemoryKind.traces, "critic": CriticKind.poca}),
