@@ -111,7 +111,8 @@ def reached_cells(row: dict[str, str]) -> tuple[str, str]:
     """Return decisions and minutes until a row was reached, of a file with `columns_of`, for a table."""
     if not row["reached"]:
         return "never", "-"
-    return f"{int(row['reached']) / 1e6:.2f} M", f"{float(row['reached_minutes']):.0f}"
+    minutes = float(row["reached_minutes"])
+    return f"{int(row['reached']) / 1e6:.2f} M", f"{minutes:.{0 if minutes > 2 else 1}f}"
 
 
 def row(run: Path, goal: float, metric: str) -> str:

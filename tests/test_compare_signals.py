@@ -64,7 +64,7 @@ def test_a_signal_s_cells_are_of_its_own_rows_by_seed(
     assert compare_signals.cells(compare_signals.rows_of(PRESET)) == [
         "0, 1",
         "0.20 M, never",
-        "1, -",
+        "1.4, -",
         "**0.85** (0.80, 0.90)",
         "0.50 M, 0.50 M",
     ]
