@@ -33,7 +33,7 @@ def test_bash_offers_presets_values_and_names() -> None:
     assert offers("mappo-train env=W") == ["Walker", "WallJump"]
     assert offers("mappo-train env=W", breaks=" ") == ["env=Walker", "env=WallJump"]
     assert offers("mappo-train seed=1 recipe=m") == ["mappo_paper", "mlagents"]
-    assert offers("mappo-train model.memory=") == ["none", "lstm", "gru"]
+    assert offers("mappo-train model.memory=") == ["none", "lstm", "gru", "traces"]
     assert offers("mappo-train env.no_graphics=t") == ["true"]
     assert offers("mappo-train hydra/la") == ["hydra/launcher="]
     assert offers("mappo-train ppo.lr_f") == ["ppo.lr_final="]
