@@ -26,10 +26,9 @@ from torch import Tensor, nn
 from mappo_unity import __version__
 from mappo_unity.config.option_table import with_article
 from mappo_unity.config.packages import PER_MEMBER, ExportError, import_package
-from mappo_unity.learning.networks.actor_critic import Actor, PerMember
+from mappo_unity.learning.networks.actor_critic import Actor, PerMember, RememberingActor
 from mappo_unity.learning.networks.encoders import OBS_CLIP
 from mappo_unity.learning.networks.recurrent import RecurrentActor
-from mappo_unity.learning.networks.traces import TracingActor
 from mappo_unity.policies.onnx_actions import BATCH, add_actions
 from mappo_unity.policies.onnx_memory import TRACES, add_memory
 from mappo_unity.policies.onnx_sensors import add_sensors, mirrored_head
@@ -57,7 +56,7 @@ def build_model(
         ExportError: the onnx package is missing, or the actor has a part that cannot be exported.
     """
     onnx = import_package("onnx")
-    memory = actor if isinstance(actor, RecurrentActor | TracingActor) else None
+    memory = actor if isinstance(actor, RememberingActor) else None
     network = _check_network(actor if memory is None else memory.actor)
     graph = Graph(onnx)
     graph.tell("version_number", [FORMAT], [1])

@@ -59,8 +59,11 @@ class Cloning:
 
         self.optimizer.param_groups[0]["lr"] = lr * self.cfg.strength * left
         losses = []
-        for _ in range(self._ppo.epochs):
-            states = self._states() if self._actor.has_memory else None
+        states = None
+        for epoch in range(self._ppo.epochs):
+            # traces do not depend on the weights that learn
+            if self._actor.is_recurrent or (self._actor.has_memory and not epoch):
+                states = self._states()
             for pieces in self._draw(wanted):
                 loss = self._loss(pieces, states)
                 self.optimizer.zero_grad()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
@@ -27,6 +27,9 @@ from mappo_unity.learning.networks.mlp import apply_options, init_head, make_mlp
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.networks.recurrent import RecurrentActor, RecurrentCritic, output_size
 from mappo_unity.learning.networks.traces import TracingActor
+
+RememberingActor: TypeAlias = RecurrentActor | TracingActor
+"""An `Actor` with a memory: it has that actor, and the width of its state, ``state_size``."""
 
 
 class Actor(nn.Module):
@@ -137,7 +140,7 @@ class UnityActor(ProbabilisticActor):
 
     def __init__(self, net: nn.Module, obs_keys: Sequence[str], layout: ActionLayout) -> None:
         in_keys = {"params": "params"} | ({"mask": keys.MASK} if layout.branches else {})
-        memory_size = net.state_size if isinstance(net, RecurrentActor | TracingActor) else 0
+        memory_size = net.state_size if isinstance(net, RememberingActor) else 0
         state = ([keys.MEMORY], [keys.MEMORY_AFTER]) if memory_size else ([], [])
         super().__init__(
             TensorDictModule(net, in_keys=[*obs_keys, *state[0]], out_keys=["params", *state[1]]),

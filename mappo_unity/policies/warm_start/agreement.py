@@ -11,9 +11,8 @@ from torch import Tensor
 
 from mappo_unity.config.packages import import_package
 from mappo_unity.errors import ConfigError
+from mappo_unity.learning.networks.actor_critic import RememberingActor
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionLayout
-from mappo_unity.learning.networks.recurrent import RecurrentActor
-from mappo_unity.learning.networks.traces import TracingActor
 from mappo_unity.policies.onnx_policy import fit_image, open_session
 from mappo_unity.policies.warm_start.onnx_network import OnnxNetwork
 
@@ -32,7 +31,7 @@ def check_agreement(network: OnnxNetwork, net: Any, sensors: Sequence[Sequence[i
         ConfigError: they differ by more than `TOLERANCE`: the file was misread.
     """
     rng = np.random.default_rng(0)
-    remembers = isinstance(net, RecurrentActor | TracingActor)
+    remembers = isinstance(net, RememberingActor)
     actor: Any = net.actor if remembers else net
     feed, inputs = _random_inputs(network, actor.encoder, sensors, rng)
     if remembers:

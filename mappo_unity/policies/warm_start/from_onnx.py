@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from mappo_unity.config.schema import LOG_STD_RANGE
+from mappo_unity.learning.networks.actor_critic import RememberingActor
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import Encoder
 from mappo_unity.learning.networks.recurrent import RecurrentActor
-from mappo_unity.learning.networks.traces import TracingActor
 from mappo_unity.policies.warm_start.onnx_network import OnnxNetwork
 from mappo_unity.policies.warm_start.sensors import STATE, Part
 
@@ -39,7 +39,7 @@ def actor_tensors(
         sensors: shapes of the behavior's sensors.
     """
     recurrent = isinstance(net, RecurrentActor)
-    actor: Any = net.actor if isinstance(net, RecurrentActor | TracingActor) else net
+    actor: Any = net.actor if isinstance(net, RememberingActor) else net
     prefix = "" if actor is net else "actor."
     out: dict[str, np.ndarray] = {}
     misfits: dict[str, str] = {}
