@@ -69,13 +69,13 @@ def main() -> None:
 
 def variants_of(workers: list[int], learners: list[int]) -> dict[str, list[str]]:
     """Return the options of each variant by its name, the plain run first."""
-    variants: dict[str, list[str]] = {"0": []}
-    for overlap in ([], ["collect.overlap=true"]):
-        for count in workers:
-            variants[f"{count}{', overlap' if overlap else ''}"] = [f"collect.workers={count}", *overlap]
+    in_turns, overlap = "collect.overlap=false", "collect.overlap=true"  # whatever a preset has
+    variants = {"0": ["collect.workers=0", in_turns]}
+    variants |= {f"{count}": [f"collect.workers={count}", in_turns] for count in workers}
+    variants |= {f"{count}, overlap": [f"collect.workers={count}", overlap] for count in workers}
     for learning in learners:
-        side_by_side = [f"learners={learning}", "update_threads=1"]
-        variants[f"0, {learning} learners"] = side_by_side
+        side_by_side = [f"learners={learning}", "update_threads=1", in_turns]
+        variants[f"0, {learning} learners"] = ["collect.workers=0", *side_by_side]
         variants[f"{learning}, {learning} learners"] = [f"collect.workers={learning}", *side_by_side]
     return variants
 

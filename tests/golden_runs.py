@@ -21,11 +21,12 @@ TIMES = ("wall_s", "steps_per_s", "collect_s", "update_s")
 
 _SMALL = ["collect.rounds=48", "ppo.minibatch_size=64", "log.loggers=[]", "log.progress=false", "seed=7"]
 _COMMON = [*_SMALL, "export_onnx=false", "num_threads=1", "update_threads=1", "checkpoint_interval=1"]
+_IN_TURNS = ["collect.workers=0", "collect.overlap=false", "ppo.objective=clip"]  # in one process
 RUNS = {
     "3DBall": ["env=3DBall", "env.num_areas=6"],
     "SoccerTwos": ["env=SoccerTwos", "env.num_areas=2", "matches.interval=400", "matches.count=2"],
     "DungeonEscape": ["env=DungeonEscape", "env.num_areas=2"],
-    "WallJump": ["env=WallJump", "env.num_areas=4"],
+    "WallJump": ["env=WallJump", "env.num_areas=4", *_IN_TURNS],
     "GridFoodCollector": ["env=GridFoodCollector", "env.num_areas=1"],
 }
 """Options of each run, besides `_COMMON`; its length is given by `STEPS`."""

@@ -14,6 +14,7 @@ from mappo_unity.config.schema import (
     CriticKind,
     DistributionKind,
     MemoryKind,
+    ObjectiveKind,
     ObsNormUpdate,
     Schedule,
     ValueNormUpdate,
@@ -143,6 +144,14 @@ def test_a_recipe_s_networks_are_the_same_for_every_preset(recipe, scene):
 def test_a_recipe_has_no_mirror_whatever_the_preset_says(recipe, scene):
     config = composed(f"recipe={recipe}", f"env={scene}")
     assert not any(model.mirror.is_used for model in models_of(config))
+
+
+@pytest.mark.parametrize("recipe", ["mlagents", "mappo_paper", "benchmarl"])
+def test_a_recipe_collects_and_learns_in_turns_whatever_the_preset_does(recipe):
+    preset, config = composed("env=WallJump"), composed(f"recipe={recipe}", "env=WallJump")
+    assert preset.collect.overlap and preset.ppo.objective is ObjectiveKind.decoupled
+    assert config.collect.workers == 0 and not config.collect.overlap
+    assert config.ppo.objective is ObjectiveKind.clip
 
 
 def models_of(config):
