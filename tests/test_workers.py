@@ -419,6 +419,24 @@ def test_what_workers_cannot_do_is_refused(lines: list[str], text: str) -> None:
     assert text in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("lines", "workers"),
+    [
+        (["parameters=WallJump_curriculum"], 0),
+        (["env.params.big_wall_height={lessons: [{value: 4}]}"], 0),
+        (["parameters=WallJump_curriculum", "collect.workers=2"], 2),
+        (["collect.workers=0"], 0),
+        ([LOCAL], 1),
+        (["bc.only=true", "bc.demos=[x.demo]"], 0),
+    ],
+)
+def test_a_presets_overlap_gives_way(lines: list[str], workers: int) -> None:
+    collect = options("env=WallJump", *lines).collect
+    assert (collect.workers, collect.overlap) == (workers, False)
+    with pytest.raises(ConfigError, match="overlap=true|bc.only=true"):
+        options("env=WallJump", *lines, "collect.overlap=true")
+
+
 def test_options_of_processes_have_an_effect_where_there_are_some() -> None:
     for lines in (["collect.timeout_s=9"], ["collect.engine=processes"], ["env.max_restarts=3"]):
         key = lines[0].partition("=")[0]

@@ -34,7 +34,7 @@ from mappo_unity.config.parameters.samplers import is_sampler
 from mappo_unity.config.plain_options import check_form
 from mappo_unity.config.presets import NO_CHOICE, conf_dir, group_choices
 from mappo_unity.config.renamed import rename_keys
-from mappo_unity.config.schema import Config
+from mappo_unity.config.schema import Config, Engine
 from mappo_unity.config.text_lines import key_name, literal_lines
 from mappo_unity.errors import ConfigError
 
@@ -78,6 +78,8 @@ def compose_config(lines: list[str], base: Path | None = None, file: Path | None
         with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
             tree = compose(name, lines, return_hydra_config=True)
             _keep_parameters_whole(tree, lines)
+            if base is None:
+                _give_way(tree, given_options(lines))
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error)) from error
 
@@ -202,6 +204,25 @@ def _keep_parameters_whole(tree: DictConfig, lines: list[str]) -> None:
             if not isinstance(raw, dict) or is_sampler(raw) or is_curriculum(raw):
                 with open_dict(tree):
                     tree.env.params[parameter] = raw
+
+
+def _give_way(tree: DictConfig, given: list[str]) -> None:
+    """Let a preset's overlap give way to what was chosen and does not go with it.
+
+    One process cannot collect while it learns, a batch must not begin before its lesson is known, and clones
+    play nothing. Whoever gives overlap as well is told so by the checks of `Config`.
+    """
+    collect = tree.collect
+    if not collect.overlap or "collect.overlap" in given:
+        return
+
+    in_one_process = not collect.workers or collect.engine is Engine.local
+    params: Any = OmegaConf.to_container(tree.env.params, resolve=False)
+    needs_turns = tree.bc.only or any(is_curriculum(value) for value in params.values())
+    if in_one_process or needs_turns:
+        collect.overlap = False
+    if needs_turns and "collect.workers" not in given:
+        collect.workers = 0
 
 
 def _resumed_root(base: Path) -> dict[Any, Any]:
