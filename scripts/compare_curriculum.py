@@ -53,9 +53,10 @@ class Way:
     options: tuple[str, ...] = ()
 
 
+IN_TURNS = "collect.workers=0", "collect.overlap=false", "ppo.objective=clip"  # a curriculum needs it
 WAYS = [
-    Way("without", "without, the preset"),
-    Way("with", "with it, over 8 M", ("parameters=WallJump_curriculum", "max_steps=8000000")),
+    Way("without", "without, the preset", IN_TURNS),
+    Way("with", "with it, over 8 M", (*IN_TURNS, "parameters=WallJump_curriculum", "max_steps=8000000")),
 ]
 
 
