@@ -428,6 +428,7 @@ def test_what_workers_cannot_do_is_refused(lines: list[str], text: str) -> None:
         (["collect.workers=0"], 0),
         ([LOCAL], 1),
         (["bc.only=true", "bc.demos=[x.demo]"], 0),
+        (["self_play.save_steps=1000", "self_play.team_change=5000"], 0),
     ],
 )
 def test_a_presets_overlap_gives_way(lines: list[str], workers: int) -> None:

@@ -34,7 +34,8 @@ from mappo_unity.config.parameters.samplers import is_sampler
 from mappo_unity.config.plain_options import check_form
 from mappo_unity.config.presets import NO_CHOICE, conf_dir, group_choices
 from mappo_unity.config.renamed import rename_keys
-from mappo_unity.config.schema import Config, Engine
+from mappo_unity.config.schema import Config
+from mappo_unity.config.schema.collect import in_one_process, what_needs_turns
 from mappo_unity.config.text_lines import key_name, literal_lines
 from mappo_unity.errors import ConfigError
 
@@ -209,19 +210,18 @@ def _keep_parameters_whole(tree: DictConfig, lines: list[str]) -> None:
 def _give_way(tree: DictConfig, given: list[str]) -> None:
     """Let a preset's overlap give way to what was chosen and does not go with it.
 
-    One process cannot collect while it learns, a batch must not begin before its lesson is known, and clones
+    One process cannot collect while it learns, the next lesson or side is known after an update, and clones
     play nothing. Whoever gives overlap as well is told so by the checks of `Config`.
     """
     collect = tree.collect
     if not collect.overlap or "collect.overlap" in given:
         return
 
-    in_one_process = not collect.workers or collect.engine is Engine.local
     params: Any = OmegaConf.to_container(tree.env.params, resolve=False)
-    needs_turns = tree.bc.only or any(is_curriculum(value) for value in params.values())
-    if in_one_process or needs_turns:
+    takes_turns = tree.bc.only or what_needs_turns(params, tree.self_play.team_change) is not None
+    if takes_turns or in_one_process(collect):
         collect.overlap = False
-    if needs_turns and "collect.workers" not in given:
+    if takes_turns and "collect.workers" not in given:
         collect.workers = 0
 
 

@@ -9,7 +9,7 @@ from typing import Any, Optional
 
 from mappo_unity.config.parameters.values import curricula
 from mappo_unity.config.schema.checks import at_least, not_empty, rule, within
-from mappo_unity.config.schema.collect import CollectConfig
+from mappo_unity.config.schema.collect import CollectConfig, what_needs_turns
 from mappo_unity.config.schema.env import Backend, EnvConfig
 from mappo_unity.config.schema.log import LogConfig
 from mappo_unity.config.schema.model import ModelConfig
@@ -110,19 +110,9 @@ class Config:
         if self.bc.only:
             raise ConfigError(f"{what} does not go with bc.only=true, where nothing is played; leave it out")
 
-        change = self.self_play.team_change if self.self_play.is_on else None
-        if self.collect.overlap and change is not None:
-            raise ConfigError(
-                f"self_play.team_change={change} does not go with collect.overlap=true: the next batch would "
-                "begin before it is known that the other side learns; give collect.overlap=false"
-            )
-
-        lessons = curricula(env.parameters)
-        if self.collect.overlap and lessons:
-            raise ConfigError(
-                f"env.params.{next(iter(lessons))} has lessons, which do not go with collect.overlap=true: "
-                "the next batch would begin before its lesson is known; give collect.overlap=false"
-            )
+        reason = what_needs_turns(env.params, self.self_play.team_change)
+        if self.collect.overlap and reason is not None:
+            raise ConfigError(f"{reason}; give collect.overlap=false")
         self._check_shares(what)
 
     def _check_shares(self, what: str) -> None:
