@@ -6,10 +6,11 @@ with the official configuration through mappo-player, our preset through the sam
 the scene embedded. A run that ends by itself (max_steps) is over earlier. Returns through the player are
 those that the player itself notes; embedded ones are those of metrics.csv. Where teams play against each
 other no return tells who plays well: what each has saved then plays matches, against random players and
-against what mlagents-learn has saved.
+against what mlagents-learn has saved. With --patience it trains on for so many times the minutes (not where
+teams play), to show when it comes to the target; what the three earn is compared after MINUTES.
 
     python scripts/race_peer.py --peer VENV/bin/mlagents-learn --official ml-agents/config \\
-        --scenes 3DBall=3 Basic=3 [--seeds 0] [--out outputs/race]
+        --scenes 3DBall=3 Basic=3 [--patience 1] [--seeds 0] [--out outputs/race]
     python scripts/race_peer.py --draw          # only the table docs/benchmarks/race.md and the picture
 
 What was measured stands in docs/benchmarks/race.csv and race_matches.csv, and is not run again.
@@ -30,29 +31,14 @@ from typing import Any
 
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
 from peer_command import add_peer_options, check_peer_options, their_command
-from recorded_player import ROOT, make_player
+from race_page import EMBEDDED, MATCHES, PEER, PLAYER, RACE, WINDOW, write_page
+from recorded_player import make_player
 from run_script import run_script
 from score_measures import share_won
-from score_page import put_between
 
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.metrics_csv import read_metrics
 
-RACE = ROOT / "docs/benchmarks/race.csv"
-MATCHES = ROOT / "docs/benchmarks/race_matches.csv"
-PAGE = ROOT / "docs/benchmarks/race.md"
-PEER, PLAYER, EMBEDDED = "mlagents-learn", "preset through the player", "preset embedded"
-COLORS = {PEER: "tab:orange", PLAYER: "tab:cyan", EMBEDDED: "tab:blue"}
-TARGETS = {
-    "3DBall": 95.0,
-    "Basic": 0.9,
-    "DungeonEscape": 0.5,
-    "Hallway": 0.7,
-    "PushBlock": 4.5,
-    "Pyramids": 1.75,
-    "WallJump": 0.8,
-}
-"""Returns that show a scene learnt."""
-WINDOW = 100  # episodes of a mean
 POINTS = 60  # of a curve
 COMPETITIVE = ("SoccerTwos",)
 NUM_MATCHES = 400
@@ -65,9 +51,14 @@ def main() -> None:
     )
     add_peer_options(parser)
     parser.add_argument("--scenes", type=minutes_of, nargs="+", default=[], metavar="SCENE=MINUTES")
+    parser.add_argument(
+        "--patience", type=float, default=1.0, help="how many times MINUTES mlagents-learn gets"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--out", type=Path, default=Path("outputs/race"))
     arguments = parser.parse_args()
+    if arguments.patience < 1:
+        raise ConfigError(f"--patience={arguments.patience:g} must be at least 1")
     if arguments.scenes:
         check_peer_options(arguments, [scene for scene, _ in arguments.scenes])
 
@@ -76,7 +67,8 @@ def main() -> None:
             # who begins changes, as the machine's load does
             order = [PEER, PLAYER, EMBEDDED] if seed % 2 == 0 else [EMBEDDED, PLAYER, PEER]
             for who in order:
-                race(arguments, scene, seed, who, 60 * minutes)
+                waits = who == PEER and scene not in COMPETITIVE  # matches are of what the same minutes gave
+                race(arguments, scene, seed, who, 60 * minutes * (arguments.patience if waits else 1))
             if scene in COMPETITIVE:
                 play_matches(arguments, scene, seed, minutes)
 
@@ -231,91 +223,6 @@ def embedded_curve(folder: Path, start: float) -> list[tuple[float, int, float]]
     rows = [row for row in read_metrics(path) if row["episodes"] >= WINDOW]
     beside_s = path.stat().st_mtime - start - rows[-1]["wall_s"] if rows else 0.0
     return [(row["wall_s"] + beside_s, int(row["agent_steps"]), row["return_mean"]) for row in rows]
-
-
-def write_page() -> None:
-    """Write the table, and the picture if matplotlib is there."""
-    rows = [row for row in read_rows(RACE) if float(row["second"]) <= float(row["limit"])]
-    runs: dict[tuple[str, str], dict[str, list[dict[str, str]]]] = {}
-    for row in rows:
-        runs.setdefault((row["scene"], row["seed"]), {}).setdefault(row["who"], []).append(row)
-
-    names = [PEER, PLAYER, EMBEDDED]
-    lines = [
-        f"| scene | seed | minutes | {' | '.join(names)} | seconds to the target | load |",
-        "|---" * 8 + "|",
-    ]
-    for (scene, seed), by_who in sorted(runs.items()):
-        cells = [f"{float(by_who[who][-1]['return']):.3g}" if who in by_who else "-" for who in names]
-        times = [reached(by_who.get(who, []), scene) for who in names]
-        limit = max(float(own[0]["limit"]) for own in by_who.values()) / 60
-        loads = " ".join(dict.fromkeys(own[0]["load"] for own in by_who.values()))
-        target = f"{TARGETS[scene]:g}: {', '.join(times)}" if scene in TARGETS else "-"
-        lines.append(f"| {scene} | {seed} | {limit:g} | {' | '.join(cells)} | {target} | {loads} |")
-    lines += matches_table()
-
-    PAGE.write_text(put_between(PAGE.read_text(), ("<!-- table -->\n", "<!-- end -->\n"), lines))
-    print("\n".join(lines))
-    draw(runs)
-
-
-def matches_table() -> list[str]:
-    """Return the lines of a table: who won what share of the decided matches."""
-    cells: dict[tuple[str, str, str, str], dict[str, str]] = {}
-    for row in read_rows(MATCHES):
-        key = row["scene"], row["seed"], row["minutes"], row["against"]
-        share = f"{100 * float(row['won']):.1f} % ({100 * float(row['stderr']):.1f})"
-        cells.setdefault(key, {})[row["who"]] = f"{share}, {int(row['decisions']) / 1e6:.2f} M"
-    if not cells:
-        return []
-    names = [PEER, PLAYER, EMBEDDED]
-    lines = ["", f"| matches | seed | minutes | against | {' | '.join(names)} |", "|---" * 7 + "|"]
-    for key, by_who in cells.items():
-        lines.append(f"| {' | '.join(key)} | {' | '.join(by_who.get(who, '-') for who in names)} |")
-    return lines
-
-
-def reached(rows: list[dict[str, str]], scene: str) -> str:
-    """Return the second at which a curve first stood at the scene's target."""
-    if not rows:
-        return "-"
-    hits = (row["second"] for row in rows if float(row["return"]) >= TARGETS.get(scene, float("inf")))
-    first = next(hits, None)
-    return f"{float(first):.0f}" if first is not None else "never"
-
-
-def draw(runs: dict[tuple[str, str], dict[str, list[dict[str, str]]]]) -> None:
-    """Draw a panel for each scene: return against minutes."""
-    try:
-        import matplotlib
-    except ImportError:
-        return
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    scenes = sorted({scene for scene, _ in runs})
-    if not scenes:
-        return
-    columns = min(2, len(scenes))
-    figure, axes = pyplot.subplots(
-        -(-len(scenes) // columns),
-        columns,
-        figsize=(5 * columns, 3.2 * -(-len(scenes) // columns)),
-        layout="constrained",
-        squeeze=False,
-    )
-    for axis, scene in zip(axes.flat, scenes):
-        for (name, _), by_who in runs.items():
-            for who, rows in by_who.items() if name == scene else ():
-                minutes = [float(row["second"]) / 60 for row in rows]
-                axis.plot(minutes, [float(row["return"]) for row in rows], color=COLORS[who], label=who)
-        handles = {label: handle for handle, label in zip(*axis.get_legend_handles_labels())}
-        axis.set(title=scene, xlabel="minutes", ylabel="return, last 100 episodes")
-        axis.grid(alpha=0.3)
-        axis.legend(handles.values(), handles.keys(), fontsize=8)
-    for axis in axes.flat[len(scenes) :]:
-        axis.remove()
-    figure.savefig(RACE.with_suffix(".png"), dpi=80)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
+import race_page
 import race_peer
 from peer_command import their_command
 
@@ -19,7 +20,8 @@ from peer_command import their_command
 @pytest.fixture
 def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
     """Return the arguments of a race of SoccerTwos whose three runs lie in a folder."""
-    monkeypatch.setattr(race_peer, "MATCHES", tmp_path / "race_matches.csv")
+    for module in (race_page, race_peer):
+        monkeypatch.setattr(module, "MATCHES", tmp_path / "race_matches.csv")
     arguments = argparse.Namespace(out=tmp_path)
     for who in (race_peer.PEER, race_peer.PLAYER, race_peer.EMBEDDED):
         run = race_peer.folder_of(arguments, "SoccerTwos", 0, who) / "run"
@@ -50,7 +52,7 @@ def test_what_was_saved_plays_random_players_and_the_peer_once(arguments, monkey
     wanted = [(theirs, "random"), *((run, against) for run in ours for against in ("random", theirs))]
     assert [words[0::2][:2] for words in played] == [(f"run={run}", f"opponent={a}") for run, a in wanted]
 
-    lines = race_peer.matches_table()
+    lines = race_page.matches_table()
     ours_cell = "90.0 % (2.0), 0.50 M"
     assert lines[3] == f"| SoccerTwos | 0 | 10 | random | 90.0 % (2.0), 0.25 M | {ours_cell} | {ours_cell} |"
     assert lines[4].startswith("| SoccerTwos | 0 | 10 | mlagents-learn | - | 75.0 % (2.0), 0.50 M |")
@@ -72,3 +74,27 @@ def test_pyramids_is_raced_with_the_official_rnd(tmp_path):
     their_command(arguments, "Pyramids", 0, 1000, tmp_path / "player", tmp_path)
     configuration = yaml.safe_load((tmp_path / "configuration.yaml").read_text())
     assert configuration == {"behaviors": {"PyramidsRND": {"max_steps": 1000}}}
+
+
+def curve(limit: float, seconds: float, *points: tuple[float, float]) -> list[dict[str, str]]:
+    """Return the rows of one trainer: (second, return), its time and what it had of it."""
+    facts = {"limit": str(limit), "seconds": str(seconds), "load": "1.0-1.0"}
+    return [{"second": str(at), "return": str(value)} | facts for at, value in points]
+
+
+def test_the_peer_may_train_on_after_the_minutes_that_are_compared():
+    by_who = {
+        race_page.PEER: curve(600, 600, (50, -0.2), (120, 0.1), (500, 0.6)),
+        race_page.PLAYER: curve(120, 120, (30, 0.4), (60, 0.75), (119, 0.9)),
+        race_page.EMBEDDED: curve(120, 40, (20, 0.7), (40, 0.95)),
+    }
+    row = race_page.race_row("Hallway", "0", by_who)
+    assert row == "| Hallway | 0 | 2 | 0.1 | 0.9 | 0.95 | 0.7: > 600, 60, 20 | > 10.0, > 30.0 | 1.0-1.0 |"
+
+    by_who[race_page.PEER] = curve(600, 600, (50, -0.2), (500, 0.8))
+    by_who[race_page.PLAYER] = curve(120, 90, (90, 0.5))  # made all its decisions
+    row = race_page.race_row("Hallway", "0", by_who)
+    assert "| 0.7: 500, -, 20 | -, 25.0 |" in row
+
+    by_who[race_page.PEER] = curve(600, 400, (50, -0.2), (400, 0.6))
+    assert "| 0.7: -, -, 20 | -, - |" in race_page.race_row("Hallway", "0", by_who)

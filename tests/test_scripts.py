@@ -49,6 +49,7 @@ MISTAKES = [
     ("draw_scenes.py Nope", "Nope: there is no such scene"),
     ("make_zoo.py nowhere", "nowhere/config.yaml cannot be read"),
     ("race_peer.py --scenes Basic=1", "--peer and --official are needed"),
+    ("race_peer.py --scenes Basic=1 --patience 0.5", "--patience=0.5 must be at least 1"),
     ("race_peer.py --scenes Basic", "invalid minutes_of value: 'Basic'"),
     ("score_doctor.py nowhere", "nowhere: there is no such fault"),
     ("score_table.py Nope", "Nope: there is no such scene"),
