@@ -438,6 +438,24 @@ def test_a_presets_overlap_gives_way(lines: list[str], workers: int) -> None:
         options("env=WallJump", *lines, "collect.overlap=true")
 
 
+@pytest.mark.parametrize(
+    ("lines", "workers"),
+    [
+        ([], 2),
+        (["env.num_areas=6"], 2),
+        (["env.num_areas=1"], 1),
+        (["env.num_areas=null"], 0),
+        (["env.backend=player", "env.file_name=x"], 1),
+        (["env.backend=player", "env.file_name=x", "env.num_players=4"], 2),
+        (["env.backend=editor"], 1),
+        (["env.backend=custom", "env.factory=a:b"], 2),
+    ],
+)
+def test_a_preset_has_as_many_workers_as_can_share(lines: list[str], workers: int) -> None:
+    collect = options("env=Pyramids", *lines).collect
+    assert (collect.workers, collect.overlap) == (workers, workers > 0)
+
+
 def test_options_of_processes_have_an_effect_where_there_are_some() -> None:
     for lines in (["collect.timeout_s=9"], ["collect.engine=processes"], ["env.max_restarts=3"]):
         key = lines[0].partition("=")[0]

@@ -35,7 +35,7 @@ from mappo_unity.config.plain_options import check_form
 from mappo_unity.config.presets import NO_CHOICE, conf_dir, group_choices
 from mappo_unity.config.renamed import rename_keys
 from mappo_unity.config.schema import Config
-from mappo_unity.config.schema.collect import in_one_process, what_needs_turns
+from mappo_unity.config.schema.workers import give_way
 from mappo_unity.config.text_lines import key_name, literal_lines
 from mappo_unity.errors import ConfigError
 
@@ -80,7 +80,7 @@ def compose_config(lines: list[str], base: Path | None = None, file: Path | None
             tree = compose(name, lines, return_hydra_config=True)
             _keep_parameters_whole(tree, lines)
             if base is None:
-                _give_way(tree, given_options(lines))
+                give_way(tree, given_options(lines))
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error)) from error
 
@@ -205,24 +205,6 @@ def _keep_parameters_whole(tree: DictConfig, lines: list[str]) -> None:
             if not isinstance(raw, dict) or is_sampler(raw) or is_curriculum(raw):
                 with open_dict(tree):
                     tree.env.params[parameter] = raw
-
-
-def _give_way(tree: DictConfig, given: list[str]) -> None:
-    """Let a preset's overlap give way to what was chosen and does not go with it.
-
-    One process cannot collect while it learns, the next lesson or side is known after an update, and clones
-    play nothing. Whoever gives overlap as well is told so by the checks of `Config`.
-    """
-    collect = tree.collect
-    if not collect.overlap or "collect.overlap" in given:
-        return
-
-    params: Any = OmegaConf.to_container(tree.env.params, resolve=False)
-    takes_turns = tree.bc.only or what_needs_turns(params, tree.self_play.team_change) is not None
-    if takes_turns or in_one_process(collect):
-        collect.overlap = False
-    if takes_turns and "collect.workers" not in given:
-        collect.workers = 0
 
 
 def _resumed_root(base: Path) -> dict[Any, Any]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Optional
+from typing import Optional
 
-from mappo_unity.config.parameters.curriculum import is_curriculum
 from mappo_unity.config.schema.checks import above, at_least
 from mappo_unity.errors import ConfigError
 
@@ -53,25 +51,3 @@ class CollectConfig:
 def in_one_process(collect: CollectConfig) -> bool:
     """Return whether nothing can be collected while the learner learns."""
     return not collect.workers or collect.engine is Engine.local
-
-
-def what_needs_turns(params: Mapping[str, Any], team_change: Optional[int]) -> Optional[str]:
-    """Return what keeps a batch from beginning before the last one is learnt from; None where nothing does.
-
-    Args:
-        params: parameters of the environment, as options write them (env.params).
-        team_change: self_play.team_change.
-    """
-    for name, value in params.items():
-        if is_curriculum(value):
-            return (
-                f"env.params.{name} has lessons, which do not go with collect.overlap=true: "
-                "the next batch would begin before its lesson is known"
-            )
-
-    if team_change is not None:
-        return (
-            f"self_play.team_change={team_change} does not go with collect.overlap=true: "
-            "the next batch would begin before it is known that the other side learns"
-        )
-    return None

@@ -9,13 +9,14 @@ from typing import Any, Optional
 
 from mappo_unity.config.parameters.values import curricula
 from mappo_unity.config.schema.checks import at_least, not_empty, rule, within
-from mappo_unity.config.schema.collect import CollectConfig, what_needs_turns
+from mappo_unity.config.schema.collect import CollectConfig
 from mappo_unity.config.schema.env import Backend, EnvConfig
 from mappo_unity.config.schema.log import LogConfig
 from mappo_unity.config.schema.model import ModelConfig
 from mappo_unity.config.schema.ppo import PPOConfig
 from mappo_unity.config.schema.rewards import BCConfig, RewardsConfig
 from mappo_unity.config.schema.self_play import MatchConfig, SelfPlayConfig
+from mappo_unity.config.schema.workers import what_needs_turns, what_workers_share
 from mappo_unity.errors import ConfigError
 
 
@@ -121,14 +122,10 @@ class Config:
         if env.backend is Backend.editor and workers > 1:
             raise ConfigError(f"{what} does not go with env.backend=editor: there is one Editor")
 
-        shared: Optional[int] = None
-        if env.backend in (Backend.embedded, Backend.pettingzoo):
-            key, shared = "env.num_areas", env.num_areas
-            if shared is None:
-                raise ConfigError(f"{what} shares the areas: give env.num_areas, a multiple of {workers}")
-        elif env.backend in (Backend.player, Backend.registry):
-            key, shared = "env.num_players", env.num_players
-        if shared is not None and shared % workers:
+        key, shared = what_workers_share(env) or ("", workers)
+        if shared is None:
+            raise ConfigError(f"{what} shares the areas: give env.num_areas, a multiple of {workers}")
+        if shared % workers:
             below, above = shared // workers * workers, -(-shared // workers) * workers
             choices = f"{below} or {above}" if below else f"{above}"
             raise ConfigError(
