@@ -23,11 +23,12 @@ from run_script import run_script
 
 from mappo_unity.protocol.demos.reader import read_demo
 
+AS_SEEN = "model.memory=none", "model.normalize_obs=false"  # less to know by heart in ten episodes
 DEMOS = {
     "3DBall": ("Expert3DBall", ["max_steps=60000", "ppo.lr=1e-3"]),
     "Basic": ("ExpertBasic", ["max_steps=20000", "ppo.lr=1e-3"]),
     "Hallway": ("ExpertHallway", ["max_steps=100000", "ppo.lr=2e-3"]),
-    "Pyramids": ("ExpertPyramid", ["max_steps=100000", "ppo.lr=1e-3", "model.hidden=[128,128]"]),
+    "Pyramids": ("ExpertPyramid", ["max_steps=100000", "ppo.lr=1e-3", "model.hidden=[128,128]", *AS_SEEN]),
     "PushBlock": ("ExpertPushBlock", ["max_steps=100000", "ppo.lr=1e-3"]),
 }
 RECORDED_AS = {"PushBlock": ["env.params.gravity=9.81"]}
