@@ -238,6 +238,21 @@ def test_rare_rewards_and_equal_ones() -> None:
     assert found(never | {"decisions": 19_999}) == [], "a resumed run: too early to say"
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "rewards.rnd.strength=0.1"),
+        ({"rewards.rnd.strength": "0.0"}, "rewards.rnd.strength=0.1"),
+        ({"rewards.rnd.strength": "0.1"}, "novelty is rewarded already"),
+        ({"behaviors.Probe.rewards.curiosity.strength": "0.1"}, "novelty is rewarded already"),
+    ],
+)
+def test_what_a_run_has_already_is_not_proposed(options: dict[str, str], words: str) -> None:
+    never = FACTS | {"decisions": 20_000, "rewards": FACTS["rewards"] | {"nonzero": 0}}
+    cures = [f.cure for f in diagnose(Evidence(run_of(options), {"Probe": never})) if f.kind == "no reward"]
+    assert len(cures) == 1 and f"If it is far to find: {words}" in cures[0]
+
+
 def test_a_frozen_behavior_has_no_findings_of_learning() -> None:
     still = {"Ball/kl": 1e-9, "Ball/clip_fraction": 0.0, "kl": 1e-9, "clip_fraction": 0.0}
     run = run_of(return_mean=0.0, **still, **{"Goal/frozen": 1.0})

@@ -167,8 +167,8 @@ def _rewards(evidence: Evidence, name: str, facts: Facts, is_long: bool) -> Iter
                 "no reward",
                 f"{name}: there was never a reward",
                 f"0 in {amount(facts['decisions'])} decisions, {amount(episodes['count'])} episodes",
-                "is AddReward (AddGroupReward) called? If it is far to find: rewards.rnd.strength=0.1, "
-                "rewards.curiosity.strength=0.1, a curriculum, or demonstrations (bc.demos)",
+                "is AddReward (AddGroupReward) called? "
+                f"If it is far to find: {_ways_to_find(evidence, name)}",
             )
         return
 
@@ -179,8 +179,7 @@ def _rewards(evidence: Evidence, name: str, facts: Facts, is_long: bool) -> Iter
             "equal returns",
             f"{name}: every episode earns the same",
             f"{amount(episodes['least'])} in each of {amount(episodes['count'])}",
-            "reward what the agent does; if its goal was never met: rewards.rnd.strength=0.1, a curriculum, "
-            "or demonstrations (bc.demos)",
+            f"reward what the agent does; if its goal was never met: {_ways_to_find(evidence, name)}",
         )
 
     largest = max(-rewards["least"], rewards["greatest"])
@@ -191,6 +190,14 @@ def _rewards(evidence: Evidence, name: str, facts: Facts, is_long: bool) -> Iter
             f"up to {amount(largest)}",
             "ppo.normalize_values=popart, or rewards of about 1",
         )
+
+
+def _ways_to_find(evidence: Evidence, name: str) -> str:
+    """Return what helps to a goal that is never met, but for what the run has already."""
+    ways = "a curriculum, or demonstrations (bc.demos)"
+    if any(evidence.number(f"rewards.{stream}.strength", name) > 0 for stream in ("rnd", "curiosity")):
+        return f"novelty is rewarded already and may need longer; else {ways}"
+    return f"rewards.rnd.strength=0.1, rewards.curiosity.strength=0.1, {ways}"
 
 
 def _sensors(facts: Facts, size: int) -> Iterator[tuple[str, range]]:
