@@ -456,6 +456,12 @@ def test_a_preset_has_as_many_workers_as_can_share(lines: list[str], workers: in
     assert (collect.workers, collect.overlap) == (workers, workers > 0)
 
 
+def test_a_team_change_without_a_pool_goes_with_overlap() -> None:
+    recipe = ["env=SoccerTwos", "recipe=mlagents", "self_play.save_steps=null"]
+    cfg = options(*recipe, "collect.workers=2", "collect.overlap=true")
+    assert cfg.self_play.team_change is not None and not cfg.self_play.is_on and cfg.collect.overlap
+
+
 def test_options_of_processes_have_an_effect_where_there_are_some() -> None:
     for lines in (["collect.timeout_s=9"], ["collect.engine=processes"], ["env.max_restarts=3"]):
         key = lines[0].partition("=")[0]

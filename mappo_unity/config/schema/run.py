@@ -111,7 +111,7 @@ class Config:
         if self.bc.only:
             raise ConfigError(f"{what} does not go with bc.only=true, where nothing is played; leave it out")
 
-        reason = what_needs_turns(env.params, self.self_play.team_change)
+        reason = what_needs_turns(env.params, self.self_play)
         if self.collect.overlap and reason is not None:
             raise ConfigError(f"{reason}; give collect.overlap=false")
         self._check_shares(what)

@@ -62,7 +62,12 @@ class SelfPlayConfig:
     @property
     def is_on(self) -> bool:
         """Whether there is a pool of opponents."""
-        return self.save_steps is not None or bool(self.fixed)
+        return has_pool(self)
+
+
+def has_pool(self_play: SelfPlayConfig) -> bool:
+    """Return whether past or fixed opponents are met; also of a tree of options that is no dataclass yet."""
+    return self_play.save_steps is not None or bool(self_play.fixed)
 
 
 @dataclass

@@ -11,26 +11,29 @@ from omegaconf import DictConfig, OmegaConf
 from mappo_unity.config.parameters.curriculum import is_curriculum
 from mappo_unity.config.schema.collect import in_one_process
 from mappo_unity.config.schema.env import Backend, EnvConfig
+from mappo_unity.config.schema.self_play import SelfPlayConfig, has_pool
 
 
 def what_workers_share(env: EnvConfig) -> Optional[tuple[str, Optional[int]]]:
-    """Return an option and its value, of which each worker has a share; None: each has a whole environment.
+    """Return what each worker has a share of, and how many there are; None: each has a whole environment.
 
-    The value may be None: as many as the environment has, which is not known before it is started.
+    The number may be None: as many areas as the environment has, which is not known before it is started.
     """
     if env.backend in (Backend.embedded, Backend.pettingzoo):
         return "env.num_areas", env.num_areas
     if env.backend in (Backend.player, Backend.registry):
         return "env.num_players", env.num_players
+    if env.backend is Backend.editor:
+        return "env.backend", 1
     return None
 
 
-def what_needs_turns(params: Mapping[str, Any], team_change: Optional[int]) -> Optional[str]:
+def what_needs_turns(params: Mapping[str, Any], self_play: SelfPlayConfig) -> Optional[str]:
     """Return what keeps a batch from beginning before the last one is learnt from; None where nothing does.
 
     Args:
         params: parameters of the environment, as options write them (env.params).
-        team_change: self_play.team_change.
+        self_play: its options; without a pool of opponents no side takes turns.
     """
     for name, value in params.items():
         if is_curriculum(value):
@@ -39,9 +42,9 @@ def what_needs_turns(params: Mapping[str, Any], team_change: Optional[int]) -> O
                 "the next batch would begin before its lesson is known"
             )
 
-    if team_change is not None:
+    if has_pool(self_play) and self_play.team_change is not None:
         return (
-            f"self_play.team_change={team_change} does not go with collect.overlap=true: "
+            f"self_play.team_change={self_play.team_change} does not go with collect.overlap=true: "
             "the next batch would begin before it is known that the other side learns"
         )
     return None
@@ -63,14 +66,12 @@ def give_way(tree: DictConfig, given: list[str]) -> None:
         return
 
     params: Any = OmegaConf.to_container(env.params, resolve=False)
-    takes_turns = tree.bc.only or what_needs_turns(params, tree.self_play.team_change) is not None
+    takes_turns = tree.bc.only or what_needs_turns(params, tree.self_play) is not None
 
     if "collect.workers" not in given:
         _, shared = what_workers_share(env) or ("", collect.workers)
         if takes_turns or shared is None:
             collect.workers = 0
-        elif env.backend is Backend.editor:
-            collect.workers = 1
         else:
             collect.workers = math.gcd(collect.workers, shared)
 
