@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import os
 import shutil
 import signal
@@ -36,7 +37,6 @@ from recorded_player import make_player
 from run_script import run_script
 from score_measures import share_won
 
-from mappo_unity.errors import ConfigError
 from mappo_unity.runs.metrics_csv import read_metrics
 
 POINTS = 60  # of a curve
@@ -52,13 +52,11 @@ def main() -> None:
     add_peer_options(parser)
     parser.add_argument("--scenes", type=minutes_of, nargs="+", default=[], metavar="SCENE=MINUTES")
     parser.add_argument(
-        "--patience", type=float, default=1.0, help="how many times MINUTES mlagents-learn gets"
+        "--patience", type=patience_of, default=1.0, help="how many times MINUTES mlagents-learn gets"
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--out", type=Path, default=Path("outputs/race"))
     arguments = parser.parse_args()
-    if arguments.patience < 1:
-        raise ConfigError(f"--patience={arguments.patience:g} must be at least 1")
     if arguments.scenes:
         check_peer_options(arguments, [scene for scene, _ in arguments.scenes])
 
@@ -76,9 +74,24 @@ def main() -> None:
 
 
 def minutes_of(word: str) -> tuple[str, float]:
-    """Return the scene and the minutes of SCENE=MINUTES; raises ValueError."""
+    """Return the scene and the minutes of SCENE=MINUTES; raises ArgumentTypeError."""
     scene, _, minutes = word.partition("=")
-    return scene, float(minutes)
+    return scene, _number_from(0, minutes, f"{word} must be SCENE=MINUTES, such as 3DBall=3")
+
+
+def patience_of(word: str) -> float:
+    """Return how many times the minutes; raises ArgumentTypeError."""
+    return _number_from(1, word, f"{word} must be a number of at least 1")
+
+
+def _number_from(least: float, word: str, rule: str) -> float:
+    try:
+        number = float(word)
+    except ValueError:
+        number = math.nan
+    if not least <= number < math.inf:  # not a number fails this as well
+        raise argparse.ArgumentTypeError(rule)
+    return number
 
 
 def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s: float) -> None:

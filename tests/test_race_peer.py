@@ -98,3 +98,17 @@ def test_the_peer_may_train_on_after_the_minutes_that_are_compared():
 
     by_who[race_page.PEER] = curve(600, 400, (50, -0.2), (400, 0.6))
     assert "| 0.7: -, -, 20 | -, - |" in race_page.race_row("Hallway", "0", by_who)
+
+
+@pytest.mark.parametrize("word", ["0.5", "nan", "inf", "-1", "twice", ""])
+def test_patience_is_a_number_of_at_least_one(word):
+    assert race_peer.patience_of("1.6") == 1.6
+    with pytest.raises(argparse.ArgumentTypeError, match="must be a number of at least 1"):
+        race_peer.patience_of(word)
+
+
+@pytest.mark.parametrize("word", ["Basic", "Basic=", "Basic=nan", "Basic=-3", "Basic=soon", "Basic=inf"])
+def test_a_scene_comes_with_its_minutes(word):
+    assert race_peer.minutes_of("Basic=3") == ("Basic", 3.0)
+    with pytest.raises(argparse.ArgumentTypeError, match="must be SCENE=MINUTES, such as 3DBall=3"):
+        race_peer.minutes_of(word)
