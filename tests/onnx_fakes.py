@@ -22,7 +22,7 @@ def make(sensors, continuous=0, branches=(), joint=False, team_size=1, head_scal
     layout = ActionLayout(continuous, tuple(branches), joint)
     cfg = ModelConfig(**{"hidden": [32, 32], "init_log_std": -0.5} | model)
     actor = make_actor(ObsLayout.from_shapes(sensors, goals=goals), layout, team_size, cfg)
-    net = actor[0].module
+    net = getattr(actor[0].module, "actor", actor[0].module)  # of one that has traces: the networks
     with torch.no_grad():
         if team_size == 1:
             net.net[-1].weight.mul_(head_scale)

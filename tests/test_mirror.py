@@ -11,12 +11,20 @@ import torch
 from mlagents_envs.base_env import ActionTuple
 from onnx_fakes import data_of, inputs, make
 
+from mappo_unity import keys
 from mappo_unity.cli import train_main
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.per_behavior import behavior_config
-from mappo_unity.config.schema import CriticKind, DistributionKind, ImageKind, MirrorConfig, ModelConfig
+from mappo_unity.config.schema import (
+    CriticKind,
+    DistributionKind,
+    ImageKind,
+    MemoryKind,
+    MirrorConfig,
+    ModelConfig,
+)
 from mappo_unity.errors import ConfigError
-from mappo_unity.learning.networks.actor_critic import make_critic
+from mappo_unity.learning.networks.actor_critic import make_critic, with_traces
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.networks.mirror import make_mirror
@@ -158,6 +166,55 @@ def test_a_critic_values_a_situation_as_its_mirror_image(critic):
     assert apart < 1e-5 if critic is CriticKind.local else apart > 1e-3
 
 
+TRACED = {"memory": MemoryKind.traces, "memory_traces": [0.5, 0.9], "memory_traced": [1, 1, 12, 3]}
+
+
+def walked(traces, obs):
+    """Return the traces ``[..., M]`` behind each of the decisions ``[T, ..., O]`` of an episode."""
+    rows = [torch.zeros(*obs.shape[1:-1], traces.size)]
+    for seen in obs:
+        rows.append(traces.after(rows[-1], seen))
+    return rows[1:]
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_who_remembers_in_the_mirror_has_the_image_of_its_memory(normalize):
+    """An episode and its mirror image: what traces keep of them, and what is done at their ends."""
+    mirror = MirrorConfig(**RAYS, **CONTINUOUS, branches=[0, 2, 1, 1, 0])
+    net = make([[12], [3]], 3, [3, 2], mirror=mirror, normalize_obs=normalize, **TRACED)[0].module
+    sides, traces = net.actor.mirror, net.traces
+    episode = torch.randn(6, 7, 15)
+    image = sides.both(episode, torch.zeros(6, 7, traces.size))[0][1]
+
+    own, others = walked(traces, episode), walked(traces, image)
+    for seen, after, other in zip(episode, own, others):
+        assert torch.allclose(sides.both(seen, after)[1][1], other, atol=1e-6)
+    assert not torch.allclose(own[-1], others[-1], atol=0.1)
+
+    found, after = net(episode[-1], own[-2])
+    other, image_after = net(image[-1], others[-2])
+    assert torch.allclose(after, own[-1]) and torch.allclose(image_after, others[-1])
+    assert torch.allclose(other[:, 6:], found[:, [6, 8, 7, 10, 9]], atol=1e-5)
+    assert torch.allclose(other[:, :3], found[:, [1, 0, 2]] * torch.tensor([1.0, 1, -1]), atol=1e-5)
+    forgotten, _ = net(episode[-1], torch.zeros_like(own[-2]))
+    assert (forgotten - found).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("critic", [CriticKind.local, CriticKind.central, CriticKind.mean])
+def test_a_critic_values_what_it_remembers_as_its_mirror_image(critic):
+    cfg = model(critic, mirror=MirrorConfig(**RAYS), critic_traces=[0.8], critic_traced=[12, 3])
+    net = make_critic(ObsLayout(15), 2, cfg, LAYOUT).module
+    torch.nn.init.normal_(net.head.weight)
+    obs, traces, present = torch.randn(5, 2, 15), torch.randn(5, 2, 4), torch.rand(5, 2, 1) < 0.8
+    flags = [] if critic is CriticKind.local else [present, torch.zeros_like(present)]
+
+    seen, kept = (both[1] for both in net.mirror.both(obs, traces))
+    assert torch.equal(kept, traces[..., [1, 0, 2, 3]] * torch.tensor([1.0, 1, -1, 1]))
+    found = net(obs, traces, *flags)
+    assert torch.allclose(found, net(seen, kept, *flags), atol=1e-5)
+    assert (found - net(seen, traces, *flags)).abs().max() > 1e-3
+
+
 def test_without_a_mirror_nothing_is_different():
     assert make_mirror(MirrorConfig(), ObsLayout(4), LAYOUT) is None
     names = make_critic(ObsLayout(4), 1, ModelConfig(), LAYOUT).state_dict()
@@ -197,6 +254,25 @@ def test_an_onnx_file_plays_as_its_network_and_gives_it_back(tmp_path, kind, lay
     }
     other = make(sensors, 3, [3, 2], **options)
     rows, error = copy_network(network, other, sensors)
+    assert not any(row.reason for row in rows) and error <= 1e-5
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("sensors", [[[12], [3]], [[15], [3, 22, 20]]])
+def test_a_file_with_a_memory_plays_as_its_network_and_gives_it_back(tmp_path, sensors, normalize):
+    flips = len(sensors[1]) == 3
+    mirror = MirrorConfig(**RAYS, flip_images=flips, branches=[0, 2, 1])
+    options = {"mirror": mirror, "normalize_obs": normalize, **TRACED}
+    actor, sample = make(sensors, 0, [3], **options), inputs(sensors, [3])
+    sample |= {keys.MEMORY: torch.randn(40, actor.memory_size)}
+    data = data_of(actor, sensors)
+    assert compare(data, actor, sensors, sample) <= 1e-5
+
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(data)
+    network = read_network(path)
+    assert network.options["memory"] == "traces" and network.options["mirror"]["swap"] == [12, 13, 1]
+    rows, error = copy_network(network, make(sensors, 0, [3], **options), sensors)
     assert not any(row.reason for row in rows) and error <= 1e-5
 
 
@@ -265,6 +341,17 @@ def test_a_run_trains_resumes_and_is_what_others_begin_with(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "model.mirror=(negate=[3]) contradicts" in said
     assert "has mirror=(swap=[0, 19, 1, 1, 18, 1, 2, 17, ...] branches=[0, 2, 1]): leave" in said
+
+
+@pytest.mark.parametrize("more", [["model.memory=traces"], ["model.critic_traces=[0.9]"]])
+def test_a_run_that_remembers_trains_resumes_and_is_what_others_begin_with(tmp_path, capsys, more):
+    run, begun = tmp_path / "run", tmp_path / "begun"
+    lines = [*TINY, *more, BASIC, "model.mirror.branches=[0,2,1]", f"hydra.run.dir={run}"]
+    assert train_main(lines) == 0
+    assert train_main([f"resume={run}", "max_steps=1024"]) == 0
+    start = f"init_from={run}/checkpoints/final.onnx"
+    assert train_main([*TINY, start, f"hydra.run.dir={begun}"]) == 0
+    capsys.readouterr()
 
 
 def test_what_a_preset_describes_can_be_left_aside():
@@ -344,6 +431,12 @@ def test_what_is_no_mirror_image_is_refused(options, message):
     assert message in str(error.value) and str(error.value).startswith("model.mirror")
 
 
+def test_traces_of_one_of_two_that_change_places_are_refused():
+    obs = with_traces(ObsLayout(15), [0.9], [12, 14])
+    with pytest.raises(ConfigError, match="columns 12 and 13 change places, of which traces keep 12 alone"):
+        make_mirror(MirrorConfig(**RAYS), obs, LAYOUT)
+
+
 @pytest.mark.parametrize(
     "lines, message",
     [
@@ -356,7 +449,14 @@ def test_what_is_no_mirror_image_is_refused(options, message):
             ["env=Basic", BASIC, "model.mirror.flip_images=true"],
             "flip_images=true has no effect: there are no images",
         ),
-        (["env=Basic", BASIC, "model.memory=lstm"], "model.mirror needs model.memory=none, not lstm"),
+        (
+            ["env=Basic", BASIC, "model.memory=lstm"],
+            "model.mirror needs model.memory=none or traces, not lstm",
+        ),
+        (
+            ["env=Basic", BASIC, "model.critic_traces=[0.9]", "model.critic_traced=[0,3]"],
+            "columns 0 and 19 change places, of which traces keep 0 alone: name both in",
+        ),
         ([*WALKER, "model.memory=gru"], "not known; model.mirror.use=false does without"),
         (["env=Basic", BASIC, "model.critic=poca"], "not poca: its baseline sees actions"),
         ([*SOCCER, "model.flatten_branches=true"], "needs model.flatten_branches=false, not true"),

@@ -212,10 +212,6 @@ def test_a_run_is_resumed_to_the_bit(learners: int, tmp_path: Path, monkeypatch:
         (["model.critic_traces=[0.9]", "model.critic_traced=[3]"], "must hold runs of columns"),
         (["model.critic_traces=[0.9]", "model.critic_traced=[-1,2]"], "must hold runs of columns"),
         (["model.critic_traces=[0.9]", "model.critic_traced=[0,0]"], "must hold runs of columns"),
-        (
-            ["model.critic_traces=[0.9]", "model.mirror.negate=[0]"],
-            r"model.mirror needs model.critic_traces=\[\]",
-        ),
     ],
 )
 def test_what_does_not_go_is_refused(lines: list[str], message: str) -> None:

@@ -92,7 +92,7 @@ def _gru(graph: Any, memory: Memory, features: str, state: str) -> str:
 
 
 def add_traces(graph: Any, encoder: Encoder, vectors: str, batch: str) -> str:
-    """Add an encoder's traces to a graph; return the name of what the network takes of them ``[batch, M]``.
+    """Add an encoder's traces to a graph; return the name of those after this decision ``[batch, M]``.
 
     Args:
         graph: an `onnx_graph.Graph`.
@@ -117,18 +117,25 @@ def add_traces(graph: Any, encoder: Encoder, vectors: str, batch: str) -> str:
     seen = graph.node("Gather", [vectors, graph.constant("traces.columns", columns, np.int64)], axis=1)
     seen = graph.node("Add", [graph.node("Mul", [seen, row("scale", scale)]), row("shift", shift)])
     kept = graph.node("Mul", [state, row("decay", net.decays.expand_as(given))])
-    norms = running_norms(encoder.norm)
-    after = graph.node("Add", [kept, seen], f"{TRACES}.after" if norms else TRACES)
+    after = graph.node("Add", [kept, seen], f"{TRACES}.after" if running_norms(encoder.norm) else TRACES)
     graph.node("Unsqueeze", [after], "recurrent_out", axes=[1])
     graph.output("recurrent_out", [batch, 1, net.size])
-    return _normalised_traces(graph, norms[0], net, after) if norms else after
+    return after
 
 
-def _normalised_traces(graph: Any, norm: RunningNorm, net: ObservationTraces, after: str) -> str:
+def read_traces(graph: Any, encoder: Encoder, traces: str, name: str) -> str:
+    """Add what the network takes of traces, under a name; return the name of it, ``[batch, M]``."""
+    assert encoder.traces is not None
+    for norm in running_norms(encoder.norm):
+        return _normalised_traces(graph, norm, encoder.traces, traces, name)
+    return traces
+
+
+def _normalised_traces(graph: Any, norm: RunningNorm, net: ObservationTraces, after: str, name: str) -> str:
     """Add `ObservationTraces.forward`, clipped, decay by decay."""
     width, parts = len(net.columns), []
-    mean = graph.constant("traces.mean", norm.mean[net.columns].unsqueeze(0))
-    inv_std = graph.constant("traces.inv_std", norm.inv_std[net.columns].unsqueeze(0))
+    mean = graph.constant(f"{name}.mean", norm.mean[net.columns].unsqueeze(0))
+    inv_std = graph.constant(f"{name}.inv_std", norm.inv_std[net.columns].unsqueeze(0))
 
     def cut(first: int, end: int) -> str:
         return graph.node("Slice", [after], axes=[1], starts=[first], ends=[end])
@@ -137,4 +144,4 @@ def _normalised_traces(graph: Any, norm: RunningNorm, net: ObservationTraces, af
         share = cut(first + width, first + width + 1)
         shifted = graph.node("Sub", [cut(first, first + width), graph.node("Mul", [share, mean])])
         parts += [graph.node("Mul", [shifted, inv_std]), share]
-    return graph.node("Clip", [graph.node("Concat", parts, axis=1)], TRACES, min=-OBS_CLIP, max=OBS_CLIP)
+    return graph.node("Clip", [graph.node("Concat", parts, axis=1)], name, min=-OBS_CLIP, max=OBS_CLIP)

@@ -13,7 +13,7 @@ from mappo_unity.learning.networks.attention import ABSENT, HEADS, EntityEncoder
 from mappo_unity.learning.networks.encoders import Encoder
 from mappo_unity.learning.networks.mirror import Mirror
 from mappo_unity.policies.onnx_actions import BATCH
-from mappo_unity.policies.onnx_memory import add_traces
+from mappo_unity.policies.onnx_memory import TRACES, add_traces, read_traces
 
 
 def add_sensors(
@@ -54,20 +54,26 @@ def add_sensors(
     if vectors:
         views = [graph.node("Concat", vectors, axis=1)]
         if mirror is not None:
-            views.append(_vector_image(graph, views[0], mirror))
+            views.append(_image_of(graph, views[0], mirror.columns, mirror.signs, "mirror"))
         for features, view in zip(sides, views):
             features.insert(0, graph.layer(encoder.norm, view, "norm"))
-        if encoder.traces is not None:  # which a mirrored network does not have
-            sides[0].insert(1, add_traces(graph, encoder, views[0], BATCH))
+        if encoder.traces is not None:
+            views = [add_traces(graph, encoder, views[0], BATCH)]
+            if mirror is not None:
+                own = mirror.trace_columns, mirror.trace_signs
+                views.append(_image_of(graph, views[0], *own, "mirror.traces"))
+            for features, view, name in zip(sides, views, (TRACES, f"{TRACES}.image")):
+                features.insert(1, read_traces(graph, encoder, view, name))
 
     return [_with_entities(graph, encoder, _joined(graph, features), sets) for features in sides]
 
 
-def _vector_image(graph: Any, obs: str, mirror: Mirror) -> str:
-    """Add the mirror image of all vectors ``[batch, O]``."""
-    columns = graph.constant("mirror.columns", mirror.columns, np.int64)
-    signs = graph.constant("mirror.signs", mirror.signs[None])
-    return graph.node("Mul", [graph.node("Gather", [obs, columns], axis=1), signs])
+def _image_of(graph: Any, x: str, columns: torch.Tensor, signs: torch.Tensor, name: str) -> str:
+    """Add the mirror image of vectors or traces ``[batch, *]``."""
+    places = graph.constant(f"{name}.columns", columns, np.int64)
+    return graph.node(
+        "Mul", [graph.node("Gather", [x, places], axis=1), graph.constant(f"{name}.signs", signs[None])]
+    )
 
 
 def _with_entities(

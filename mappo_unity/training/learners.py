@@ -12,7 +12,7 @@ from mappo_unity.envs.replay import read_fitting
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.imitation.cloning import Cloning
 from mappo_unity.learning.imitation.expert import Expert, make_expert
-from mappo_unity.learning.networks.actor_critic import make_actor, make_critic
+from mappo_unity.learning.networks.actor_critic import make_actor, make_critic, with_traces
 from mappo_unity.learning.networks.distributions import ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
 from mappo_unity.learning.networks.images import check_sides
@@ -113,9 +113,8 @@ def check_learners(cfg: Config, env: Played, learners: Mapping[str, PolicyLearne
 def check_columns(name: str, obs: ObsLayout, layout: ActionLayout, model: ModelConfig) -> None:
     """Raise ConfigError, naming the policy, where `model.mirror` or traces do not fit it."""
     try:
-        make_mirror(model.mirror, obs, layout)
-        model.traces_of_actor(obs.vector)
-        model.traces_of_critic(obs.vector)
+        for traces in (model.traces_of_actor(obs.vector), model.traces_of_critic(obs.vector)):
+            make_mirror(model.mirror, with_traces(obs, *traces), layout)
     except ConfigError as error:
         raise ConfigError(f"{error} ({name})") from error
 

@@ -227,21 +227,16 @@ class ModelConfig:
 
     def _check_mirrored(self) -> None:
         for option, value, needed in (
-            ("memory", self.memory, MemoryKind.none),
-            ("flatten_branches", self.flatten_branches, False),
-            ("critic_traces", list(self.critic_traces), []),
+            ("memory", self.memory.value if self.is_recurrent else "", "none or traces"),
+            ("flatten_branches", "true" if self.flatten_branches else "", "false"),
         ):
-            if value != needed:
+            if value:
                 raise ConfigError(
-                    f"model.mirror needs model.{option}={_show(needed)}, not {_show(value)}: what that looks "
-                    f"like in a mirror is not known; {WITHOUT_MIRROR}"
+                    f"model.mirror needs model.{option}={needed}, not {value}: what that looks like in a "
+                    f"mirror is not known; {WITHOUT_MIRROR}"
                 )
         if self.critic is CriticKind.poca:
             raise ConfigError(
                 "model.mirror needs model.critic=local, central, mean or attention, not poca: its baseline "
                 f"sees actions, which are not mirrored there; {WITHOUT_MIRROR}"
             )
-
-
-def _show(value: object) -> str:
-    return str(value.value) if isinstance(value, Enum) else str(value).lower()

@@ -196,7 +196,7 @@ def make_actor(obs: ObsLayout, layout: ActionLayout, team_size: int, cfg: ModelC
     layout = replace(layout, squashed=squashed)
 
     if cfg.share_parameters or team_size == 1:
-        net: nn.Module = Actor(_with_traces(obs, *cfg.traces_of_actor(obs.vector)), layout, cfg)
+        net: nn.Module = Actor(with_traces(obs, *cfg.traces_of_actor(obs.vector)), layout, cfg)
         if cfg.is_recurrent:
             net = RecurrentActor(net, cfg)
             init_head(net.head, cfg, layout.num_means)
@@ -219,7 +219,7 @@ def make_critic(
         layout: the sizes of an action, which MA-POCA's baseline reads.
         streams: reward streams V, which have a value each.
     """
-    obs = _with_traces(obs, *cfg.traces_of_critic(obs.vector))
+    obs = with_traces(obs, *cfg.traces_of_critic(obs.vector))
     local = team_size == 1 or cfg.critic is CriticKind.local
     in_keys = list(obs.keys) if local else [*obs.keys, keys.PRESENT, keys.DEPARTED]
 
@@ -253,7 +253,8 @@ def _critic(
     return net if mirror is None else MirroredCritic(net, mirror)
 
 
-def _with_traces(obs: ObsLayout, decays: Sequence[float], columns: Sequence[int]) -> ObsLayout:
+def with_traces(obs: ObsLayout, decays: Sequence[float], columns: Sequence[int]) -> ObsLayout:
+    """Return the entries of a network that reads traces of some columns; without columns it reads none."""
     return replace(obs, traces=tuple(decays), traced=tuple(columns))
 
 

@@ -33,6 +33,7 @@ class Mirror(nn.Module):
     Args:
         columns, signs: of vectors ``[..., O]`` column i of the image is ``signs[i] * x[columns[i]]``; none
             where there are no vectors.
+        trace_columns, trace_signs: the same of the traces that the network reads; none where it reads none.
         widths: of each image the dimension of its columns, counted from the end.
         out_columns, out_signs: the same of the outputs.
         continuous: of the outputs, how many of the first ones are means.
@@ -41,6 +42,8 @@ class Mirror(nn.Module):
 
     columns: Tensor
     signs: Tensor
+    trace_columns: Tensor
+    trace_signs: Tensor
     out_columns: Tensor
     out_signs: Tensor
 
@@ -48,6 +51,8 @@ class Mirror(nn.Module):
         self,
         columns: np.ndarray,
         signs: np.ndarray,
+        trace_columns: np.ndarray,
+        trace_signs: np.ndarray,
         widths: Sequence[int],
         out_columns: np.ndarray,
         out_signs: np.ndarray,
@@ -58,12 +63,19 @@ class Mirror(nn.Module):
         for name, values, dtype in (
             ("columns", columns, torch.int64),
             ("signs", signs, torch.float32),
+            ("trace_columns", trace_columns, torch.int64),
+            ("trace_signs", trace_signs, torch.float32),
             ("out_columns", out_columns, torch.int64),
             ("out_signs", out_signs, torch.float32),
         ):
             # they follow from the options, which a checkpoint holds
             self.register_buffer(name, torch.tensor(values.tolist(), dtype=dtype), persistent=False)
         self.widths, self.continuous, self.options = list(widths), continuous, options
+
+    @property
+    def num_entries(self) -> int:
+        """How many observation entries have an image: vectors, traces, images."""
+        return bool(len(self.columns)) + bool(len(self.trace_columns)) + len(self.widths)
 
     def both(self, *obs: Tensor) -> list[Tensor]:
         """Return each of an agent's observations ``[..., *]`` and its mirror image, ``[2, ..., *]``.
@@ -73,9 +85,10 @@ class Mirror(nn.Module):
         """
         images = list(obs)
         out = []
-        if len(self.columns):
-            vector = images.pop(0)
-            out.append(torch.stack([vector, vector.index_select(-1, self.columns) * self.signs]))
+        for columns, signs in ((self.columns, self.signs), (self.trace_columns, self.trace_signs)):
+            if len(columns):
+                vector = images.pop(0)
+                out.append(torch.stack([vector, vector.index_select(-1, columns) * signs]))
         return out + [torch.stack([x, x.flip(dim)]) for x, dim in zip(images, self.widths, strict=True)]
 
     def image(self, out: Tensor) -> Tensor:
@@ -112,7 +125,7 @@ class MirroredCritic(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return values ``[..., A, V]``."""
-        count = bool(len(self.mirror.columns)) + len(self.mirror.widths)
+        count = self.mirror.num_entries
         flags = [torch.stack([flag, flag]) for flag in inputs[count:]]
         values: Tensor = self.critic(*self.mirror.both(*inputs[:count]), *flags)
         return values.mean(0)
@@ -138,6 +151,7 @@ def make_mirror(cfg: MirrorConfig, obs: ObsLayout, layout: ActionLayout) -> Mirr
         )
 
     columns, signs = _observations(cfg, obs.vector)
+    traces = _traces(obs, columns, signs)
     actions, action_signs = _continuous(cfg, layout.continuous)
     logits = _logits(cfg, layout.branches)
 
@@ -147,7 +161,7 @@ def make_mirror(cfg: MirrorConfig, obs: ObsLayout, layout: ActionLayout) -> Mirr
     out_signs = np.concatenate([action_signs, np.ones(deviations + len(logits))])
     dims = obs.channel_dims or (FIRST,) * len(obs.images)
     widths = [-1 if dim == FIRST else -2 for dim in dims]
-    return Mirror(columns, signs, widths, out_columns, out_signs, size, asdict(cfg))
+    return Mirror(columns, signs, *traces, widths, out_columns, out_signs, size, asdict(cfg))
 
 
 def _observations(cfg: MirrorConfig, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -180,6 +194,25 @@ def _observations(cfg: MirrorConfig, size: int) -> tuple[np.ndarray, np.ndarray]
             f"model.mirror.rays and swap name column {(times > 1).argmax()} twice: it changes places once"
         )
     return columns, _signs("negate", cfg.negate, columns, "columns")
+
+
+def _traces(obs: ObsLayout, columns: np.ndarray, signs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the image of traces ``[..., K * (n + 1)]``: averages of images are images of averages."""
+    traced = list(obs.traced)
+    if not traced:
+        return columns[:0], signs[:0]
+
+    for column, image in zip(traced, columns[traced]):
+        if image not in traced:
+            raise ConfigError(
+                f"model.mirror lets columns {column} and {image} change places, of which traces keep "
+                f"{column} alone: name both in model.memory_traced or model.critic_traced, or neither"
+            )
+
+    # behind the columns of each decay stands the share of the average that is filled
+    own = np.array([*(traced.index(image) for image in columns[traced]), len(traced)])
+    starts = np.arange(len(obs.traces)) * len(own)
+    return (starts[:, None] + own).ravel(), np.tile([*signs[traced], 1.0], len(obs.traces))
 
 
 def _continuous(cfg: MirrorConfig, size: int) -> tuple[np.ndarray, np.ndarray]:
