@@ -50,7 +50,7 @@ def measure(scene: str) -> None:
     """Print what one scene's preset takes."""
     cfg = compose_config([f"env={scene}", "log.loggers=[]"]).config
     with tempfile.TemporaryDirectory() as out, set_up(cfg, Path(out)) as setup, setup.collecting() as batches:
-        state, before, collected = RunState(cfg, Path(out), setup), peak(), None
+        state, before, collected = RunState(cfg, Path(out), setup), peak(), 0
         for _ in range(ITERATIONS):
             batch = next(batches)
             size = batch.rounds.bytes() + sum(part.bytes() for part in batch.following.values())

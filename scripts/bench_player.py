@@ -29,6 +29,7 @@ from mappo_unity.cli.player import run as player_main
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
 from mappo_unity.envs.backends import make_env_function
+from mappo_unity.envs.unity_env import UnityEnv
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol import decode, messages
 from mappo_unity.protocol.serve import Player, env_function
@@ -78,7 +79,8 @@ def options(arguments: argparse.Namespace, build: str, *more: str) -> Config:
     if arguments.max_steps is not None:
         lines.append(f"max_steps={arguments.max_steps}")
     quiet = ["log.loggers=[]", "log.progress=false", "export_onnx=false", "matches.interval=null"]
-    return compose_config([*lines, *quiet, f"seed={arguments.seed}"]).config
+    # whose player is measured is the one of this process
+    return compose_config([*lines, *quiet, "collect.workers=0", f"seed={arguments.seed}"]).config
 
 
 # ---- stepping with random actions: ML-Agents' client, ours, no link at all
@@ -177,7 +179,7 @@ def parts(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
     """Print what a round costs in player, transport, decoding, adapter and policy, CPU microseconds."""
     stack = ExitStack()
     setup = stack.enter_context(set_up(cfg, folder / "parts"))
-    base_env: Any = setup.env.base_env
+    base_env: Any = env_of(setup).base_env
     pid = base_env.player.process.pid
     bare = mlagents_client(cfg)
     batches = stack.enter_context(setup.collecting())
@@ -254,11 +256,17 @@ def decoding(data: bytes, steps: int) -> float:
     return cpu_of(once, steps)
 
 
+def env_of(setup: TrainingSetup) -> UnityEnv:
+    """Return the environment, which this process plays."""
+    assert isinstance(setup.env, UnityEnv)
+    return setup.env
+
+
 def policy(setup: TrainingSetup, steps: int) -> float:
     """Return what the policy costs a round, CPU us."""
     from mappo_unity.envs.transforms import transformed
 
-    observations = transformed(setup.env).reset()
+    observations = transformed(env_of(setup)).reset()
     with torch.no_grad():
         return cpu_of(lambda: setup.policy(observations.clone(recurse=False)), steps)
 
@@ -321,7 +329,7 @@ def train(cfg: Config, arguments: argparse.Namespace, folder: Path) -> None:
     """Train until the mean return over a full window reaches the goal."""
     with set_up(cfg, folder / "train") as setup, setup.collecting() as batches:
         state = RunState(cfg, folder / "train", setup)
-        pid = setup.env.base_env.player.process.pid
+        pid = env_of(setup).base_env.player.process.pid
         wall, cpu, player = time.perf_counter(), time.process_time(), cpu_s(pid)
         while state.agent_steps < cfg.max_steps and not state.recent_episodes.reached(arguments.goal):
             started = time.perf_counter()

@@ -56,7 +56,8 @@ def measure(cfg: Config, repeats: int) -> None:
         rows = learner.rows.take(buffer[:])
         by_hand = HandWritten(learner, rows)
 
-        learner.update(buffer), by_hand.update()
+        learner.update(buffer)
+        by_hand.update()
         ours, theirs, ratios = [], [], []
         for _ in range(repeats):
             ours.append(timed(lambda: learner.update(buffer)))

@@ -135,11 +135,11 @@ def main() -> None:
     for match in matches:
         for seed in args.seeds:
             start = time.process_time()
-            policies = [
+            blue, purple = (
                 official_policy(args.policy, seed) if side == "official" else random_policy(seed + number)
                 for number, side in enumerate(match.split(" - "))
-            ]
-            report(match, seed, play(*policies, args.episodes, seed), time.process_time() - start)
+            )
+            report(match, seed, play(blue, purple, args.episodes, seed), time.process_time() - start)
     for seed in args.seeds:
         start = time.process_time()
         score = play(random_policy(seed), random_policy(seed + 1), args.episodes, seed, "StrikersVsGoalie")

@@ -236,8 +236,16 @@ def draw(scene: str, curves: Curves) -> None:
     from matplotlib import pyplot
 
     heights = [3, 1] if lessons_of(curves) > 1 else [3]
-    shape = {"figsize": (10, 1 + 1.1 * sum(heights)), "height_ratios": heights, "layout": "constrained"}
-    figure, axes = pyplot.subplots(len(heights), 2, sharex="col", sharey="row", squeeze=False, **shape)
+    figure, axes = pyplot.subplots(
+        len(heights),
+        2,
+        sharex="col",
+        sharey="row",
+        squeeze=False,
+        height_ratios=heights,
+        figsize=(10, 1 + 1.1 * sum(heights)),
+        layout="constrained",
+    )
 
     for column, place, scale in ((axes[:, 0], 0, 1e6), (axes[:, 1], 1, 1.0)):
         for number, (critic, own) in enumerate(curves.items()):

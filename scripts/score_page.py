@@ -227,7 +227,7 @@ def draw_seeds(
 
     start, end = max(c[0][0] for c in curves), min(c[-1][0] for c in curves)
     at = np.linspace(start, end, 100)
-    values = np.array([np.interp(at, *zip(*points)) for points in curves])
+    values = np.array([np.interp(at, *np.array(points).T) for points in curves])
     mean, spread = values.mean(0), values.std(0)
     axis.plot(at, mean, color=color, linewidth=2, label=f"{label}mean of {len(curves)} seeds")
     axis.fill_between(at, mean - spread, mean + spread, color=color, alpha=0.15, linewidth=0)

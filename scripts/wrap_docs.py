@@ -25,9 +25,10 @@ def wrap(text: str, width: int = WIDTH) -> str:
     def flush() -> None:
         if not paragraph:
             return
-        item = ITEM.match(paragraph[0])
-        first = item.group(0) if item else re.match(" *", paragraph[0]).group(0)
-        rest = paragraph[0][len(first) :]
+        line = paragraph[0]
+        item = ITEM.match(line)
+        first = item.group(0) if item else " " * (len(line) - len(line.lstrip(" ")))
+        rest = line[len(first) :]
         words = " ".join([rest, *paragraph[1:]])
         later = " " * len(first)
         out.extend(_break(words, width, first, later))
