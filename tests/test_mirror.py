@@ -63,9 +63,23 @@ def reflect_soccer(scene):
     scene.load_scene_state(state)
 
 
+def reflect_dungeon(scene):
+    """Make the second room, portal and all, what the first one looks like in a mirror at x = 0."""
+    state = scene.scene_state()
+    room, sides = state["room"], np.array([-1, 1, 1])
+    room["position"][3:] = room["position"][:3] * sides
+    room["yaw"][3:] = -room["yaw"][:3]
+    room["thing"][1] = room["thing"][0] * sides
+    room["thing_yaw"][1] = -room["thing_yaw"][0]
+    room["dragon_speed"][1] = room["dragon_speed"][0]
+    room["_dragon_way"][1] = room["_dragon_way"][0] * [-1, 1]
+    scene.load_scene_state(state)
+
+
 SIDES = "mirror.branches=[0,1,2,0,2,1,0,2,1]"
 SOCCER = ["env=SoccerTwos", "model.mirror.rays=[0,11,8,3,264,3,8,3]", f"model.{SIDES}"]
 WALKER = ["env=Walker", "model.mirror.use=true"]
+DUNGEON = ["env=DungeonEscape"]
 GOALIE = [
     "env=StrikersVsGoalie",
     "behaviors.Striker.model.mirror.rays=[0,11,7,3,231,3,7,3]",
@@ -76,7 +90,13 @@ GOALIE = [
 
 
 @pytest.mark.parametrize(
-    "lines, reflect", [(WALKER, reflect_walker), (SOCCER, reflect_soccer), (GOALIE, reflect_soccer)]
+    "lines, reflect",
+    [
+        (WALKER, reflect_walker),
+        (SOCCER, reflect_soccer),
+        (GOALIE, reflect_soccer),
+        (DUNGEON, reflect_dungeon),
+    ],
 )
 def test_the_mirror_image_of_a_scene_plays_as_its_mirror_image(lines, reflect):
     """What agents see in two areas, one the other's image, under actions that are each other's image."""
@@ -395,6 +415,28 @@ def test_what_a_preset_says_of_a_behavior_gives_way_to_its_file(tmp_path):
         config = compose_config(["env=StrikersVsGoalie", *lines]).config
         with pytest.raises(ConfigError, match=r"^behaviors.Goalie.model.mirror=.* options among use, rays"):
             adopt_file_options(config, lines)
+
+
+@pytest.mark.parametrize("option", ["memory=lstm", "memory=gru", "critic=poca", "flatten_branches=true"])
+def test_a_presets_mirror_gives_way_to_what_has_no_mirror_image(option):
+    lines = ["env=StrikersVsGoalie", f"model.{option}"]
+    found = compose_config(lines).config
+    assert all(not behavior_config(found, name).model.mirror.is_used for name in found.behaviors)
+    kept = compose_config(["env=StrikersVsGoalie", "model.memory=traces"]).config
+    assert all(behavior_config(kept, name).model.mirror.is_used for name in kept.behaviors)
+
+    for given in ("model.mirror.use=true", "behaviors.Goalie.model.mirror.rays=[0,41,6,3]"):
+        config = compose_config([*lines, given]).config
+        with pytest.raises(ConfigError, match=r"needs model\..* model.mirror.use=false does without"):
+            behavior_config(config, "Goalie")
+
+
+def test_a_file_that_asks_for_both_is_refused(tmp_path):
+    file = tmp_path / "options.yaml"
+    file.write_text("env: {name: Walker}\nmodel: {memory: gru, mirror: {use: true}}\n")
+    with pytest.raises(ConfigError, match="not gru: what that looks like in a mirror is not known"):
+        compose_config([], file=file)
+    assert not compose_config(["model.memory=lstm"], file=file).config.model.mirror.is_used
 
 
 # --- mistakes

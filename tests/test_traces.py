@@ -183,7 +183,7 @@ def test_a_critic_with_traces_knows_how_long_an_episode_has_lasted(
 SMALL = ["env=DungeonEscape", "env.num_areas=4", "model.hidden=[16]", "log.progress=false", "log.loggers=[]"]
 SMALL += ["model.critic_traces=[0.8,0.95]", "model.critic_traced=[0,10,370,1]"]
 SMALL += ["collect.batch_size=256", "ppo.minibatch_size=128", "ppo.lr_schedule=constant"]
-SMALL += ["ppo.entropy_schedule=constant"]
+SMALL += ["ppo.entropy_schedule=constant", "ppo.gamma_schedule=constant"]
 
 
 @pytest.mark.parametrize("learners", [1, 2])

@@ -35,7 +35,8 @@ from mappo_unity.config.plain_options import check_form
 from mappo_unity.config.presets import NO_CHOICE, conf_dir, group_choices
 from mappo_unity.config.renamed import rename_keys
 from mappo_unity.config.schema import Config
-from mappo_unity.config.schema.workers import give_way
+from mappo_unity.config.schema.model import let_mirror_give_way
+from mappo_unity.config.schema.workers import let_workers_give_way
 from mappo_unity.config.text_lines import key_name, literal_lines
 from mappo_unity.errors import ConfigError
 
@@ -80,7 +81,8 @@ def compose_config(lines: list[str], base: Path | None = None, file: Path | None
             tree = compose(name, lines, return_hydra_config=True)
             _keep_parameters_whole(tree, lines)
             if base is None:
-                give_way(tree, given_options(lines))
+                let_workers_give_way(tree, given_options(lines))
+                let_mirror_give_way(tree, given_options(lines))
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error)) from error
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Optional
+from typing import Any, Optional
+
+from omegaconf import DictConfig
 
 from mappo_unity.config.schema.checks import at_least, between, widths, within
 from mappo_unity.config.schema.mirror import WITHOUT_MIRROR, MirrorConfig, show_numbers
@@ -226,17 +228,39 @@ class ModelConfig:
             )
 
     def _check_mirrored(self) -> None:
-        for option, value, needed in (
-            ("memory", self.memory.value if self.is_recurrent else "", "none or traces"),
-            ("flatten_branches", "true" if self.flatten_branches else "", "false"),
-        ):
-            if value:
-                raise ConfigError(
-                    f"model.mirror needs model.{option}={needed}, not {value}: what that looks like in a "
-                    f"mirror is not known; {WITHOUT_MIRROR}"
-                )
-        if self.critic is CriticKind.poca:
-            raise ConfigError(
-                "model.mirror needs model.critic=local, central, mean or attention, not poca: its baseline "
-                f"sees actions, which are not mirrored there; {WITHOUT_MIRROR}"
-            )
+        for why in without_mirror_image(self).values():
+            raise ConfigError(f"model.mirror needs {why}; {WITHOUT_MIRROR}")
+
+
+def without_mirror_image(model: Any) -> dict[str, str]:
+    """Return the options that networks which mirror cannot have, by name, and what they need instead.
+
+    Args:
+        model: a `ModelConfig`, or a tree that one is made of.
+    """
+    out = {}
+    unknown = "what that looks like in a mirror is not known"
+    if model.memory in (MemoryKind.lstm, MemoryKind.gru):
+        out["memory"] = f"model.memory=none or traces, not {model.memory.value}: {unknown}"
+    if model.flatten_branches:
+        out["flatten_branches"] = f"model.flatten_branches=false, not true: {unknown}"
+    if model.critic is CriticKind.poca:
+        out["critic"] = (
+            "model.critic=local, central, mean or attention, not poca: its baseline sees actions, which are "
+            "not mirrored there"
+        )
+    return out
+
+
+def let_mirror_give_way(tree: DictConfig, given: list[str]) -> None:
+    """Let a preset's mirror give way where the command line asks for what has no mirror image.
+
+    Whoever describes a mirror there as well is told so by the checks of `ModelConfig`.
+
+    Args:
+        tree: options that a `Config` is made of, changed in place.
+        given: full names of the options that the command line sets.
+    """
+    asked = any(f"model.{option}" in given for option in without_mirror_image(tree.model))
+    if asked and not any("model.mirror" in name for name in given):
+        tree.model.mirror.use = False

@@ -50,7 +50,7 @@ def what_needs_turns(params: Mapping[str, Any], self_play: SelfPlayConfig) -> Op
     return None
 
 
-def give_way(tree: DictConfig, given: list[str]) -> None:
+def let_workers_give_way(tree: DictConfig, given: list[str]) -> None:
     """Let a preset's workers and overlap give way to what was chosen and does not go with them.
 
     One process cannot collect while it learns, the next lesson or side is known after an update, and clones
