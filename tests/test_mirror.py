@@ -271,6 +271,7 @@ def test_an_onnx_file_plays_as_its_network_and_gives_it_back(tmp_path, kind, lay
         "swap_actions": [0, 1],
         "negate_actions": [2],
         "branches": [0, 2, 1, 1, 0],
+        "handed": False,
     }
     other = make(sensors, 3, [3, 2], **options)
     rows, error = copy_network(network, other, sensors)
@@ -294,6 +295,73 @@ def test_a_file_with_a_memory_plays_as_its_network_and_gives_it_back(tmp_path, s
     assert network.options["memory"] == "traces" and network.options["mirror"]["swap"] == [12, 13, 1]
     rows, error = copy_network(network, make(sensors, 0, [3], **options), sensors)
     assert not any(row.reason for row in rows) and error <= 1e-5
+
+
+# --- networks that prefer a side
+
+
+def handed(net):
+    """Return a network whose first layer prefers a side as it would after some learning."""
+    sides = [value for name, value in net.named_parameters() if name.endswith("side")]
+    assert len(sides) == 1 and not sides[0].any()
+    torch.nn.init.normal_(sides[0])
+    return net
+
+
+def test_an_actor_prefers_a_side_where_both_look_alike():
+    mirror = MirrorConfig(**RAYS, branches=[0, 2, 1, 1, 0], handed=True)
+    actor = make([[12], [3]], 0, [3, 2], mirror=mirror)[0].module
+    alike = torch.zeros(1, 15)
+    before = actor(alike)
+    assert torch.allclose(before[0, 1], before[0, 2]) and torch.allclose(before[0, 3], before[0, 4])
+
+    handed(actor)
+    still, obs = actor(alike)[0], torch.randn(7, 15)
+    assert (still[1] - still[2]).abs() > 1e-3 and (still[3] - still[4]).abs() > 1e-3
+    image = actor.mirror.both(obs)[0][1]
+    assert (actor(obs) - actor(image)[:, [0, 2, 1, 4, 3]]).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("critic", [CriticKind.local, CriticKind.central, CriticKind.mean])
+def test_a_critic_may_value_a_situation_and_its_mirror_image_apart(critic):
+    obs, present = torch.randn(5, 2, 15), torch.ones(5, 2, 1, dtype=torch.bool)
+    flags = [] if critic is CriticKind.local else [present, ~present]
+    cfg = model(critic, mirror=MirrorConfig(**RAYS, handed=True), critic_traces=[0.8], critic_traced=[12, 3])
+    net = make_critic(ObsLayout(15), 2, cfg, LAYOUT).module
+    torch.nn.init.normal_(net.head.weight)
+    seen = obs, torch.randn(5, 2, 4)
+    image = [both[1] for both in net.mirror.both(*seen)]
+
+    assert torch.allclose(net(*seen, *flags), net(*image, *flags), atol=1e-5)
+    handed(net)
+    assert (net(*seen, *flags) - net(*image, *flags)).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("options", [{}, {"layer_norm": True, "normalize_obs": True}, TRACED])
+@pytest.mark.parametrize("sensors", [[[12], [3]], [[15], [3, 22, 20]], [[3, 22, 20]]])
+def test_a_file_of_one_that_prefers_a_side_gives_it_back(tmp_path, sensors, options):
+    flips, vectors = len(sensors[-1]) == 3, len(sensors[0]) == 1
+    if options is TRACED and not vectors:
+        options = {}
+    mirror = MirrorConfig(
+        **(RAYS if vectors else {}), flip_images=flips, **CONTINUOUS, branches=[0, 2, 1], handed=True
+    )
+    options = {"mirror": mirror, **options}
+    actor, sample = make(sensors, 3, [3], head_scale=200, **options), inputs(sensors, [3])
+    handed(actor)
+    if actor.memory_size:
+        sample |= {keys.MEMORY: torch.randn(40, actor.memory_size)}
+    data = data_of(actor, sensors)
+    assert compare(data, actor, sensors, sample) <= 1e-5
+
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(data)
+    network, other = read_network(path), make(sensors, 3, [3], **options)
+    assert network.options["mirror"]["handed"] is True
+    rows, error = copy_network(network, other, sensors)
+    assert not any(row.reason for row in rows) and error <= 1e-5
+    names = [name for name in other.state_dict() if name.endswith("side")]
+    assert torch.allclose(other.state_dict()[names[0]], actor.state_dict()[names[0]], atol=1e-6)
 
 
 IMAGES = {
@@ -502,6 +570,14 @@ def test_traces_of_one_of_two_that_change_places_are_refused():
         ([*WALKER, "model.memory=gru"], "not known; model.mirror.use=false does without"),
         (["env=Basic", BASIC, "model.critic=poca"], "not poca: its baseline sees actions"),
         ([*SOCCER, "model.flatten_branches=true"], "needs model.flatten_branches=false, not true"),
+        (
+            ["env=Basic", "model.mirror.handed=true"],
+            "model.mirror.handed=true has no effect: no mirror image is described (Basic)",
+        ),
+        (
+            ["env=Basic", BASIC, "model.mirror.handed=true", "model.goal_conditioning=hyper"],
+            "model.mirror.handed=true needs model.goal_conditioning=none, not hyper",
+        ),
     ],
 )
 def test_what_cannot_be_mirrored_ends_with_a_line(lines, message, tmp_path, capsys):

@@ -28,6 +28,7 @@ from mappo_unity.config.option_table import with_article
 from mappo_unity.config.packages import PER_MEMBER, ExportError, import_package
 from mappo_unity.learning.networks.actor_critic import Actor, PerMember, RememberingActor
 from mappo_unity.learning.networks.encoders import OBS_CLIP
+from mappo_unity.learning.networks.handed import HandedLinear
 from mappo_unity.learning.networks.recurrent import RecurrentActor
 from mappo_unity.policies.onnx_actions import BATCH, add_actions
 from mappo_unity.policies.onnx_memory import TRACES, add_memory
@@ -100,9 +101,18 @@ def _add_hidden(
     With a mirror these are the features of what is seen, and behind them those of its mirror image.
     """
     features = add_sensors(graph, network.encoder, sensors, network.mirror)
-    hidden = [graph.layers(body, x, "net") for x in features]
     if network.mirror is None:
-        return hidden[0], head
+        return graph.layers(body, features[0], "net"), head
+
+    first, *rest = body
+    hidden = []
+    for x, image in zip(features, (False, True)):
+        if isinstance(first, HandedLinear):
+            bias_name = "net.0.image.bias" if image else None
+            x = graph.gemm(x, first.weight, first.bias_of(image), "net.0", bias_name)
+        else:
+            x = graph.layer(first, x, "net.0")
+        hidden.append(graph.layers(rest, x, "net", start=1))
     return graph.node("Concat", hidden, axis=1), mirrored_head(network.mirror, head)
 
 
@@ -151,9 +161,10 @@ class Graph:
         self.node("Identity", [self.constant(f"{name}_vector", values)], name)
         self.output(name, shape)
 
-    def gemm(self, x: str, weight: Tensor, bias: Tensor, name: str) -> str:
-        """Add ``x @ weight.T + bias``."""
-        inputs = [x, self.constant(f"{name}.weight", weight), self.constant(f"{name}.bias", bias)]
+    def gemm(self, x: str, weight: Tensor, bias: Tensor, name: str, bias_name: str | None = None) -> str:
+        """Add ``x @ weight.T + bias``; layers that share weights alone have names for their biases."""
+        offset = self.constant(bias_name or f"{name}.bias", bias)
+        inputs = [x, self.constant(f"{name}.weight", weight), offset]
         return self.node("Gemm", inputs, alpha=1.0, beta=1.0, transB=1)
 
     def norm_rows(self, x: str, eps: float, axis: int, name: str) -> str:
@@ -164,9 +175,9 @@ class Graph:
         std = self.node("Sqrt", [self.node("Add", [var, self.constant(f"{name}.eps", eps)])])
         return self.node("Div", [centred, std])
 
-    def layers(self, layers: Sequence[nn.Module], x: str, name: str) -> str:
-        """Add layers one after the other."""
-        for index, layer in enumerate(layers):
+    def layers(self, layers: Sequence[nn.Module], x: str, name: str, start: int = 0) -> str:
+        """Add layers one after the other; their names count from `start`."""
+        for index, layer in enumerate(layers, start):
             x = self.layer(layer, x, f"{name}.{index}")
         return x
 

@@ -39,6 +39,8 @@ class MirrorConfig:
     branches: list[int] = field(default_factory=list)
     """Of each discrete action the one that takes its place, branch after branch: [0, 2, 1] for a branch of
     none, left, right; no numbers: all stay."""
+    handed: bool = False
+    """Networks may prefer a side: where both look alike, they need not go left as often as right."""
 
     def __post_init__(self) -> None:
         for name, group in (("rays", 4), ("swap", 3), ("swap_actions", 2)):

@@ -230,6 +230,11 @@ class ModelConfig:
     def _check_mirrored(self) -> None:
         for why in without_mirror_image(self).values():
             raise ConfigError(f"model.mirror needs {why}; {WITHOUT_MIRROR}")
+        if self.mirror.handed and self.goal_conditioning is not GoalKind.none:
+            raise ConfigError(
+                "model.mirror.handed=true needs model.goal_conditioning=none, not "
+                f"{self.goal_conditioning.value}: goals may make the layer that prefers a side"
+            )
 
 
 def without_mirror_image(model: Any) -> dict[str, str]:

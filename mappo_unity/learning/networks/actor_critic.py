@@ -22,6 +22,7 @@ from mappo_unity.learning.networks.critics import CentralCritic, LocalCritic, Po
 from mappo_unity.learning.networks.distributions import ActionDistribution, ActionLayout, state_log_std
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout, RunningNorm
 from mappo_unity.learning.networks.goals import condition_on_goals
+from mappo_unity.learning.networks.handed import make_handed
 from mappo_unity.learning.networks.mirror import MirroredCritic, make_mirror
 from mappo_unity.learning.networks.mlp import apply_options, init_head, make_mlp
 from mappo_unity.learning.networks.poca import PocaCritic
@@ -44,6 +45,7 @@ class Actor(nn.Module):
         # the small last gain makes first actions almost independent of what is observed
         self.net = make_mlp(self.encoder.size, list(cfg.hidden), outputs, cfg.activation, last_gain=0.01)
         condition_on_goals(self, cfg)
+        make_handed(self, cfg.mirror)
 
         self.layout, self.init_log_std = layout, float(cfg.init_log_std)
         apply_options(self, cfg, layout.num_means)
@@ -249,6 +251,7 @@ def _critic(
         net = PocaCritic(obs, layout, team_size, cfg, head_size, streams)
 
     mirror = make_mirror(cfg.mirror, obs, layout)
+    make_handed(net, cfg.mirror)
     net = apply_options(net, cfg)
     return net if mirror is None else MirroredCritic(net, mirror)
 

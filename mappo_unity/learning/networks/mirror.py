@@ -6,6 +6,7 @@ N for that of a network's outputs, a network f becomes
     g(x) = (f(x) + N f(M x)) / 2,    so that    g(M x) = N g(x)
 
 the average over a group of two (networks that keep a game's symmetry: van der Pol et al., arXiv 2006.16908).
+A first layer that tells both apart (`handed`) loosens that where the options say so.
 Unlike learning from mirrored copies of a batch (Mittal et al., arXiv 2403.04359), it leaves PPO's ratios what
 they are.
 """
@@ -138,6 +139,8 @@ def make_mirror(cfg: MirrorConfig, obs: ObsLayout, layout: ActionLayout) -> Mirr
         ConfigError: they do not fit its observations or actions, or two images are not the original.
     """
     if not cfg.is_used:
+        if cfg.use and cfg.handed:
+            raise ConfigError("model.mirror.handed=true has no effect: no mirror image is described")
         return None
     if obs.sets:
         raise ConfigError(

@@ -52,6 +52,8 @@ def actor_tensors(
             out[f"{prefix}net.{2 * index + 1}.1.weight"], out[f"{prefix}net.{2 * index + 1}.1.bias"] = (
                 layer.norm
             )
+    if network.side is not None:
+        out[f"{prefix}net.0.side"] = network.side
     try:
         columns = _columns(network, actor.encoder, sensors)
         weight = network.layers[0].linear.weight

@@ -41,7 +41,8 @@ class OnnxNetwork:
 
     Attributes: `graph`; `actions`, their layers; `state`, the memory; `layers`, the hidden ones, first to
     last; `parts`, what the first of them takes, in its order; `vector_norm`, of all vector observations;
-    `mirror`, the options of a network of ours that mirrors, of another one the empty ones.
+    `mirror`, the options of a network of ours that mirrors, of another one the empty ones; `side`, by which
+    the first hidden layer of one that prefers a side tells both apart (`handed.HandedLinear`).
     """
 
     graph: OnnxGraph
@@ -51,6 +52,7 @@ class OnnxNetwork:
     parts: list[Part]
     vector_norm: Scale | None
     mirror: dict[str, Any]
+    side: np.ndarray | None = None
 
     @property
     def options(self) -> dict[str, Any]:
@@ -91,10 +93,10 @@ def read_network(path: Path) -> OnnxNetwork:
     """
     graph = OnnxGraph(path)
     actions = read_actions(graph)
-    mirror = asdict(MirrorConfig())
+    mirror, image = asdict(MirrorConfig()), None
     if MIRROR in graph.metadata:
         mirror |= json.loads(graph.metadata[MIRROR])
-        actions = _seen_directly(graph, actions)
+        actions, image = _seen_directly(graph, actions)
     state = read_state(graph, actions.hidden)
     layers, features = _hidden_layers(graph, actions.hidden if state is None else state.features)
 
@@ -114,15 +116,27 @@ def read_network(path: Path) -> OnnxNetwork:
             f"{path}: its hidden layers differ in their kind ({', '.join(sorted(map(str, kinds)))}); those "
             "of a network here are all alike"
         )
-    return OnnxNetwork(graph, actions, state, layers, *read_parts(graph, features), mirror)
+    side = None
+    if mirror["handed"] and image is not None:
+        layers, side = _apart(layers, _hidden_layers(graph, image)[0][-len(layers) :])
+    return OnnxNetwork(graph, actions, state, layers, *read_parts(graph, features), mirror, side)
 
 
-def _seen_directly(graph: OnnxGraph, actions: Actions) -> Actions:
+def _apart(layers: list[Hidden], image: list[Hidden]) -> tuple[list[Hidden], np.ndarray]:
+    """Return the layers with the bias that both sides share, and what tells these apart."""
+    (first, *rest), other = layers, image[0]
+    own, theirs = first.linear.bias, other.linear.bias
+    shared = first._replace(linear=first.linear._replace(bias=(own + theirs) / 2))
+    return [shared, *rest], (own - theirs) / 2
+
+
+def _seen_directly(graph: OnnxGraph, actions: Actions) -> tuple[Actions, str]:
     """Return the actions of a mirrored network as its own layers give them (`onnx_sensors.mirrored_head`).
 
-    Those of the file take the features of a situation and, behind them, of its mirror image.
+    Those of the file take the features of a situation and, behind them, of its mirror image, whose name is
+    returned, too.
     """
-    features = graph.node(graph.through(actions.hidden)).input[0]
+    features, image = graph.node(graph.through(actions.hidden)).input
 
     def half(layer: Linear) -> Linear:
         return layer._replace(x=features, weight=2 * layer.weight[:, : layer.weight.shape[1] // 2])
@@ -130,7 +144,7 @@ def _seen_directly(graph: OnnxGraph, actions: Actions) -> Actions:
     mean = None if actions.mean is None else half(actions.mean)
     raw_std = None if actions.raw_std is None else half(actions.raw_std)
     branches = [half(layer) for layer in actions.branches]
-    return replace(actions, mean=mean, raw_std=raw_std, branches=branches, hidden=features)
+    return replace(actions, mean=mean, raw_std=raw_std, branches=branches, hidden=features), image
 
 
 def _hidden_layers(graph: OnnxGraph, name: str) -> tuple[list[Hidden], str]:
