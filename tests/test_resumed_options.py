@@ -80,6 +80,17 @@ def test_a_number_that_changes_with_resume_takes_effect(tmp_path: Path, before: 
         assert len(rows(tmp_path)) == iteration
 
 
+@pytest.mark.parametrize("before", [{"num_threads": 2}, {}])
+def test_a_scene_gets_other_threads_with_resume(tmp_path: Path, before: dict[str, Any]) -> None:
+    cfg = options(3, env=EnvConfig(num_areas=6, params=before), export_onnx=False)
+    train(cfg, tmp_path, after_iteration=stop_after(1))
+    cfg.env.params = {"num_threads": 3, "mass": 5.0}
+    path, _ = checkpoint.newest_good(tmp_path)
+    scenes: list[Any] = []
+    train(cfg, tmp_path, path, lambda s: scenes.append(s.setup.env.base_env) or "interrupted")
+    assert scenes[0].num_threads == 3 and scenes[0].parameters["mass"] == 5.0
+
+
 def test_options_of_learning_that_change_with_resume_take_effect(tmp_path: Path) -> None:
     ppo = PPOConfig(minibatch_size=60, lr=0.05, lr_target_kl=1e-4)
     rewards = RewardsConfig(curiosity=CuriosityConfig(strength=0.1))

@@ -233,7 +233,8 @@ class ModelConfig:
         if self.mirror.handed and self.goal_conditioning is not GoalKind.none:
             raise ConfigError(
                 "model.mirror.handed=true needs model.goal_conditioning=none, not "
-                f"{self.goal_conditioning.value}: goals may make the layer that prefers a side"
+                f"{self.goal_conditioning.value}: goals may make the layer that prefers a side; "
+                "model.mirror.handed=false does without"
             )
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from mappo_unity.config.schema import MirrorConfig
 
-ENCODER = "encoder"
+ENCODER = "encoder"  # of observations, which looks at each side by itself
 
 
 class HandedLinear(nn.Linear):

@@ -239,7 +239,12 @@ def lessons_of(cfg: EnvConfig, env: Played) -> Lessons:
     """Return the lessons of the options; raise ConfigError where the environment does not fit them."""
     sizes = {name: env.behaviors[sides[0]].slots.team_size for name, sides in env.sides.items()}
     is_made = cfg.backend in (Backend.custom, Backend.pettingzoo)  # with the parameters as arguments
-    lessons = Lessons(cfg.parameters, sizes, sets_numbers=not is_made)
+    parameters = cfg.parameters
+    if cfg.backend is Backend.embedded:
+        # a scene is made with its threads, and has no such parameter
+        parameters.pop("num_threads", None)
+
+    lessons = Lessons(parameters, sizes, sets_numbers=not is_made)
     if lessons.numbers and not env.takes_parameters:
         raise ConfigError(
             f"env.params.{next(iter(lessons.numbers))} has lessons, but the environment's parameters cannot "
