@@ -81,8 +81,9 @@ def compose_config(lines: list[str], base: Path | None = None, file: Path | None
             tree = compose(name, lines, return_hydra_config=True)
             _keep_parameters_whole(tree, lines)
             if base is None:
-                let_workers_give_way(tree, given_options(lines))
-                let_mirror_give_way(tree, given_options(lines))
+                given = given_options(lines)
+                let_workers_give_way(tree, given)
+                let_mirror_give_way(tree, given)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error)) from error
 
