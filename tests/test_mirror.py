@@ -499,6 +499,18 @@ def test_a_presets_mirror_gives_way_to_what_has_no_mirror_image(option):
             behavior_config(config, "Goalie")
 
 
+def test_a_preferred_side_gives_way_to_weights_that_goals_make(tmp_path):
+    file = tmp_path / "options.yaml"
+    file.write_text("env: {name: Walker}\nmodel: {mirror: {use: true, handed: true}}\n")
+    lines = ["model.goal_conditioning=hyper"]
+    kept = compose_config([], file=file).config.model.mirror
+    found = compose_config(lines, file=file).config.model.mirror
+    assert kept.is_used and kept.handed and found.is_used and not found.handed
+
+    with pytest.raises(ConfigError, match="handed=true needs model.goal_conditioning=none, not hyper"):
+        compose_config([*lines, "model.mirror.handed=true"], file=file)
+
+
 def test_a_file_that_asks_for_both_is_refused(tmp_path):
     file = tmp_path / "options.yaml"
     file.write_text("env: {name: Walker}\nmodel: {memory: gru, mirror: {use: true}}\n")

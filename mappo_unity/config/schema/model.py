@@ -261,12 +261,17 @@ def without_mirror_image(model: Any) -> dict[str, str]:
 def let_mirror_give_way(tree: DictConfig, given: list[str]) -> None:
     """Let a preset's mirror give way where the command line asks for what has no mirror image.
 
-    Whoever describes a mirror there as well is told so by the checks of `ModelConfig`.
+    Where it asks for what cannot prefer a side, only that gives way. Whoever describes a mirror there as well
+    is told so by the checks of `ModelConfig`.
 
     Args:
         tree: options that a `Config` is made of, changed in place.
         given: full names of the options that the command line sets.
     """
-    asked = any(f"model.{option}" in given for option in without_mirror_image(tree.model))
-    if asked and not any("model.mirror" in name for name in given):
+    if any("model.mirror" in name for name in given):
+        return
+
+    if any(f"model.{option}" in given for option in without_mirror_image(tree.model)):
         tree.model.mirror.use = False
+    if "model.goal_conditioning" in given and tree.model.goal_conditioning is not GoalKind.none:
+        tree.model.mirror.handed = False
