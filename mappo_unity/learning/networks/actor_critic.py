@@ -45,7 +45,7 @@ class Actor(nn.Module):
         # the small last gain makes first actions almost independent of what is observed
         self.net = make_mlp(self.encoder.size, list(cfg.hidden), outputs, cfg.activation, last_gain=0.01)
         condition_on_goals(self, cfg)
-        make_handed(self, cfg.mirror)
+        make_handed(self, "net.0", cfg.mirror)
 
         self.layout, self.init_log_std = layout, float(cfg.init_log_std)
         apply_options(self, cfg, layout.num_means)
@@ -251,7 +251,6 @@ def _critic(
         net = PocaCritic(obs, layout, team_size, cfg, head_size, streams)
 
     mirror = make_mirror(cfg.mirror, obs, layout)
-    make_handed(net, cfg.mirror)
     net = apply_options(net, cfg)
     return net if mirror is None else MirroredCritic(net, mirror)
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from mappo_unity.config.schema import CriticKind, ModelConfig
 from mappo_unity.learning.networks.encoders import Encoder, ObsLayout
 from mappo_unity.learning.networks.goals import condition_on_goals
+from mappo_unity.learning.networks.handed import make_handed
 from mappo_unity.learning.networks.mlp import ACTIVATIONS, linear, make_mlp
 
 ATTENTION_HEADS = 4
@@ -42,6 +43,7 @@ class LocalCritic(Critic):
         self.encoder = Encoder(obs, cfg.normalize_obs, cfg.image_encoder, hidden[0])
         self.net = make_mlp(self.encoder.size, hidden, streams, cfg.activation, last_gain=CRITIC_GAIN)
         condition_on_goals(self, cfg)
+        make_handed(self, "net.0", cfg.mirror)
 
     def forward(self, *obs: Tensor) -> Tensor:
         """Return values."""
@@ -63,6 +65,7 @@ class CentralCritic(Critic):
         self.member = nn.Parameter(torch.randn(team_size, first) * 0.1)
         self.activation = ACTIVATIONS[cfg.activation]()
         self.net = make_mlp(first, rest, streams, cfg.activation, last_gain=CRITIC_GAIN)
+        make_handed(self, "joint", cfg.mirror)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return values; the arguments are the observation entries, ``present`` and ``departed``."""
@@ -95,6 +98,7 @@ class PooledCritic(Critic):
         )
 
         self.net = make_mlp(2 * first + 1, rest or [first], streams, cfg.activation, last_gain=CRITIC_GAIN)
+        make_handed(self, "token.0", cfg.mirror)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return values; the arguments are the observation entries, ``present`` and ``departed``."""

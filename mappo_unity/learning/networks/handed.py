@@ -13,8 +13,6 @@ from torch import Tensor, nn
 
 from mappo_unity.config.schema import MirrorConfig
 
-ENCODER = "encoder"  # of observations, which looks at each side by itself
-
 
 class HandedLinear(nn.Linear):
     """A linear layer over a situation and its mirror image, ``[2, ..., in_features]``.
@@ -38,22 +36,18 @@ class HandedLinear(nn.Linear):
         return torch.stack([both[0] + self.side, both[1] - self.side])
 
 
-def make_handed(net: nn.Module, cfg: MirrorConfig) -> None:
-    """Let the first layer behind a network's `encoder` tell both sides apart, where the options say so.
+def make_handed(net: nn.Module, first_layer: str, cfg: MirrorConfig) -> None:
+    """Let a network's first layer behind its encoder tell both sides apart, where the options say so.
 
     Args:
         net: an actor or a critic, built and not yet changed by other options.
+        first_layer: path of that layer in the network, such as ``net.0``.
         cfg: the options.
     """
     if not (cfg.is_used and cfg.handed):
         return
 
-    layers = [
-        (parent, name)
-        for path, parent in net.named_modules()
-        if path.split(".")[0] != ENCODER
-        for name, part in parent.named_children()
-        if isinstance(part, nn.Linear)
-    ]
-    parent, name = layers[0]
-    setattr(parent, name, HandedLinear(getattr(parent, name)))
+    layer = net.get_submodule(first_layer)
+    assert isinstance(layer, nn.Linear)
+    parent, _, name = first_layer.rpartition(".")
+    setattr(net.get_submodule(parent), name, HandedLinear(layer))
