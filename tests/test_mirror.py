@@ -78,7 +78,7 @@ def reflect_dungeon(scene):
 
 SIDES = "mirror.branches=[0,1,2,0,2,1,0,2,1]"
 SOCCER = ["env=SoccerTwos", "model.mirror.rays=[0,11,8,3,264,3,8,3]", f"model.{SIDES}"]
-WALKER = ["env=Walker", "model.mirror.use=true"]
+WALKER = ["env=Walker"]
 DUNGEON = ["env=DungeonEscape"]
 GOALIE = [
     "env=StrikersVsGoalie",
@@ -579,7 +579,10 @@ def test_traces_of_one_of_two_that_change_places_are_refused():
             ["env=Basic", BASIC, "model.critic_traces=[0.9]", "model.critic_traced=[0,3]"],
             "columns 0 and 19 change places, of which traces keep 0 alone: name both in",
         ),
-        ([*WALKER, "model.memory=gru"], "not known; model.mirror.use=false does without"),
+        (
+            [*WALKER, "model.mirror.use=true", "model.memory=gru"],
+            "not known; model.mirror.use=false does without",
+        ),
         (["env=Basic", BASIC, "model.critic=poca"], "not poca: its baseline sees actions"),
         ([*SOCCER, "model.flatten_branches=true"], "needs model.flatten_branches=false, not true"),
         (
