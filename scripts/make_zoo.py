@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from learn_scene import mappo_eval, read_rows
+from omegaconf import OmegaConf
 from run_script import run_script
 from score_measures import measures_of
 
-from mappo_unity.config.compose import load_config
+from mappo_unity.config.compose import compose_config, load_config
 from mappo_unity.diagnosis.evidence import amount
 from mappo_unity.policies.export import export_checkpoint
 from mappo_unity.policies.policy_files import ZOO, ZOO_FOLDER, choose_checkpoint
@@ -79,7 +80,7 @@ def add(run: Path, episodes: int | None) -> list[dict[str, Any]]:
             "earns": earned(said, file.policy),
             "seed": config.seed,
             "decisions": file.agent_steps,
-            "options": " ".join(given(run)),
+            "options": " ".join(beyond_preset(given(run), run)),
             "bytes": sizes[file.policy],
             "date": time.strftime("%Y-%m-%d"),
         }
@@ -101,6 +102,16 @@ def given(run: Path) -> list[str]:
     places = "env=", "seed=", "hydra.", "output_dir=", "resume="
     lines = [line for entry in saved for line in entry["overrides"] if not line.startswith(places)]
     return list({line.partition("=")[0]: line for line in lines}.values())
+
+
+def beyond_preset(lines: list[str], run: Path) -> list[str]:
+    """Return the options of a run without those that the preset of its scene has, too."""
+    own = compose_config([], run / "config.yaml").tree
+    preset = compose_config([f"env={own.env.name}"]).tree
+
+    names = [line.partition("=")[0] for line in lines]
+    differs = [OmegaConf.select(own, name) != OmegaConf.select(preset, name) for name in names]
+    return [line for line, is_own in zip(lines, differs) if is_own]
 
 
 def earned(said: dict[str, Any], behavior: str) -> str:

@@ -6,6 +6,9 @@ import sys
 from pathlib import Path
 
 import yaml
+from omegaconf import OmegaConf, open_dict
+
+from mappo_unity.config.compose import compose_config
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
@@ -22,3 +25,15 @@ def test_an_option_that_was_given_again_stands_once(tmp_path):
         "ppo.gamma=0.99",
         "ppo.entropy_coef_final=-0.01",
     ]
+
+
+def test_what_the_preset_has_as_well_is_no_option_of_a_card(tmp_path):
+    own = ["collect.batch_size=2048", "seed=3", "ppo.epochs=7"]
+    preset = compose_config(["env=Hallway"]).tree
+    same = [f"model.memory={preset.model.memory.name}", f"ppo.gamma={preset.ppo.gamma}"]
+    tree = compose_config(["env=Hallway", *own]).tree
+
+    with open_dict(tree):
+        tree.pop("hydra")
+    OmegaConf.save(tree, tmp_path / "config.yaml")
+    assert make_zoo.beyond_preset([own[0], *same, own[2]], tmp_path) == [own[0], own[2]]
