@@ -33,11 +33,31 @@ def without_code(text: str) -> str:
     return re.sub(r"`[^`\n]*`", "", "\n".join(lines))
 
 
-def links_of(page: Path) -> list[str]:
-    """Return the page's relative links, without their anchors."""
+def all_links_of(page: Path) -> list[str]:
+    """Return the page's links to the repository, its own headings among them."""
     found = re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text(encoding="utf-8")))
-    own = [link for link in found if "://" not in link and not link.startswith(("#", "mailto:"))]
-    return [link.split("#")[0] for link in own]
+    return [link for link in found if "://" not in link and not link.startswith("mailto:")]
+
+
+def links_of(page: Path) -> list[str]:
+    """Return the page's links to other files, without their anchors."""
+    return [link.split("#")[0] for link in all_links_of(page) if not link.startswith("#")]
+
+
+def anchors_of(text: str) -> set[str]:
+    """Return the anchors that a page's headings have both in the repository and on the site.
+
+    GitHub makes a hyphen of each space, Python-Markdown one of a row of hyphens and spaces, so that
+    the anchors of a heading like "Left- and right-handed" differ and none leads there from both.
+    """
+    anchors = set()
+    fenced = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    for heading in re.findall(r"^#+ (.+)$", fenced, flags=re.MULTILINE):
+        words = re.sub(r"[^\w\s-]", "", re.sub(r"\]\([^)]*\)", "", heading)).strip().lower()
+        repository, site = words.replace(" ", "-"), re.sub(r"[-\s]+", "-", words)
+        if repository == site:
+            anchors.add(site)
+    return anchors
 
 
 def overlong(text: str) -> list[str]:
@@ -67,6 +87,17 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
 
 
 @every_page
+def test_anchors_lead_to_headings(page: Path) -> None:
+    dead = []
+    for link in all_links_of(page):
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        if anchor and target.suffix == ".md" and anchor not in anchors_of(target.read_text(encoding="utf-8")):
+            dead.append(link)
+    assert dead == []
+
+
+@every_page
 def test_prose_has_one_width(page: Path) -> None:
     long = overlong(page.read_text(encoding="utf-8"))
     assert not long, f"over {WIDTH} columns; python scripts/wrap_docs.py wraps them: {long}"
@@ -90,4 +121,5 @@ def test_the_checks_find_what_they_look_for() -> None:
     long = "word " * 30
     assert overlong(f"{long}\n") and overlong(f"* {long}\n  {long}\n")
     assert not overlong(f"a\n\n    {long}\n\n| {long} |\n```\n{long}\n```\n{'x' * 200}\n")
+    assert anchors_of("# A `b.c` [d](e)\n```\n# code\n```\n## Left- and right\n## By-law") == {"a-bc-d", "by-law"}
     assert without_code("a\n\n    [x](y)\n\n`[x](y)` [p](q)").endswith(" [p](q)")
