@@ -121,5 +121,6 @@ def test_the_checks_find_what_they_look_for() -> None:
     long = "word " * 30
     assert overlong(f"{long}\n") and overlong(f"* {long}\n  {long}\n")
     assert not overlong(f"a\n\n    {long}\n\n| {long} |\n```\n{long}\n```\n{'x' * 200}\n")
-    assert anchors_of("# A `b.c` [d](e)\n```\n# code\n```\n## Left- and right\n## By-law") == {"a-bc-d", "by-law"}
+    headings = "# A `b.c` [d](e)\n```\n# code\n```\n## Left- and right\n## By-law"
+    assert anchors_of(headings) == {"a-bc-d", "by-law"}
     assert without_code("a\n\n    [x](y)\n\n`[x](y)` [p](q)").endswith(" [p](q)")
