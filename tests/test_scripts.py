@@ -44,6 +44,7 @@ MISTAKES = [
     ("compare_versions.py nowhere", "nowhere must be a checkout"),
     ("curve_against.py random nowhere", "nowhere does not exist"),
     ("curve_spread.py nowhere", "run=nowhere does not exist"),
+    ("curve_table.py 1e6 nowhere", "nowhere does not exist"),
     ("decisions_to.py 1 nowhere", "nowhere does not exist"),
     ("decisions_to.py much nowhere", "invalid float value: 'much'"),
     ("draw_scenes.py Nope", "Nope: there is no such scene"),
