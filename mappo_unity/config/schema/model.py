@@ -230,12 +230,11 @@ class ModelConfig:
     def _check_mirrored(self) -> None:
         for why in without_mirror_image(self).values():
             raise ConfigError(f"model.mirror needs {why}; {WITHOUT_MIRROR}")
-        if self.mirror.handed and self.goal_conditioning is not GoalKind.none:
-            raise ConfigError(
-                "model.mirror.handed=true needs model.goal_conditioning=none, not "
-                f"{self.goal_conditioning.value}: goals may make the layer that prefers a side; "
-                "model.mirror.handed=false does without"
-            )
+        if self.mirror.handed:
+            for why in without_preferred_side(self).values():
+                raise ConfigError(
+                    f"model.mirror.handed=true needs {why}; model.mirror.handed=false does without"
+                )
 
 
 def without_mirror_image(model: Any) -> dict[str, str]:
@@ -258,6 +257,16 @@ def without_mirror_image(model: Any) -> dict[str, str]:
     return out
 
 
+def without_preferred_side(model: Any) -> dict[str, str]:
+    """Return the options that networks which mirror and prefer a side cannot have; see above."""
+    if model.goal_conditioning is GoalKind.none:
+        return {}
+    return {
+        "goal_conditioning": f"model.goal_conditioning=none, not {model.goal_conditioning.value}: goals may "
+        "make the layer that prefers a side"
+    }
+
+
 def let_mirror_give_way(tree: DictConfig, given: list[str]) -> None:
     """Let a preset's mirror give way where the command line asks for what has no mirror image.
 
@@ -271,7 +280,8 @@ def let_mirror_give_way(tree: DictConfig, given: list[str]) -> None:
     if any("model.mirror" in name for name in given):
         return
 
-    if any(f"model.{option}" in given for option in without_mirror_image(tree.model)):
-        tree.model.mirror.use = False
-    if "model.goal_conditioning" in given and tree.model.goal_conditioning is not GoalKind.none:
-        tree.model.mirror.handed = False
+    model = tree.model
+    if any(f"model.{option}" in given for option in without_mirror_image(model)):
+        model.mirror.use = False
+    if any(f"model.{option}" in given for option in without_preferred_side(model)):
+        model.mirror.handed = False
