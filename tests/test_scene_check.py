@@ -180,3 +180,8 @@ def test_command_line(capsys: pytest.CaptureFixture[str]) -> None:
         assert words in capsys.readouterr().err
     assert main(["4DBall"]) == 2
     assert "choices: 3DBall" in capsys.readouterr().err
+
+
+def test_a_mistake_in_a_name_names_it_once(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["os:gotcwd"]) == 2
+    assert capsys.readouterr().err.startswith("os:gotcwd: os has no function 'gotcwd'")

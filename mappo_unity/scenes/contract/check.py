@@ -183,12 +183,11 @@ def main(arguments: list[str] | None = None) -> int:
         # Before the close: a closed environment need not show its behaviors.
         lines = _describe(env)
         check_close(env)
-    except ContractError as error:
-        print(f"{options.scene}: {error}", *error.details, sep="\n", file=sys.stderr)
-        return 1
-    except ConfigError as error:
-        print(f"{options.scene}: {error}", *error.details, sep="\n", file=sys.stderr)
-        return 2
+    except (ContractError, ConfigError) as error:
+        # a factory's own mistakes name it
+        name = "" if str(error).startswith(f"{options.scene}: ") else f"{options.scene}: "
+        print(f"{name}{error}", *error.details, sep="\n", file=sys.stderr)
+        return 1 if isinstance(error, ContractError) else 2
 
     print(*lines, _summary(options.scene, report), sep="\n")
     return 0
