@@ -76,22 +76,26 @@ def main() -> None:
 def minutes_of(word: str) -> tuple[str, float]:
     """Return the scene and the minutes of SCENE=MINUTES; raises ArgumentTypeError."""
     scene, _, minutes = word.partition("=")
-    return scene, _number_from(0, minutes, f"{word} must be SCENE=MINUTES, such as 3DBall=3")
+    number = _number(minutes)
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{word} must be SCENE=MINUTES, such as 3DBall=3")
+    return scene, number
 
 
 def patience_of(word: str) -> float:
     """Return how many times the minutes; raises ArgumentTypeError."""
-    return _number_from(1, word, f"{word} must be a number of at least 1")
-
-
-def _number_from(least: float, word: str, rule: str) -> float:
-    try:
-        number = float(word)
-    except ValueError:
-        number = math.nan
-    if not least <= number < math.inf:  # not a number fails this as well
-        raise argparse.ArgumentTypeError(rule)
+    number = _number(word)
+    if not 1 <= number < math.inf:
+        raise argparse.ArgumentTypeError(f"{word} must be a number of at least 1")
     return number
+
+
+def _number(word: str) -> float:
+    """Return the number that a word is; nan, which no rule is kept by: it is none."""
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
 
 
 def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s: float) -> None:

@@ -107,7 +107,9 @@ def test_patience_is_a_number_of_at_least_one(word):
         race_peer.patience_of(word)
 
 
-@pytest.mark.parametrize("word", ["Basic", "Basic=", "Basic=nan", "Basic=-3", "Basic=soon", "Basic=inf"])
+@pytest.mark.parametrize(
+    "word", ["Basic", "Basic=", "Basic=0", "Basic=nan", "Basic=-3", "Basic=soon", "Basic=inf"]
+)
 def test_a_scene_comes_with_its_minutes(word):
     assert race_peer.minutes_of("Basic=3") == ("Basic", 3.0)
     with pytest.raises(argparse.ArgumentTypeError, match="must be SCENE=MINUTES, such as 3DBall=3"):
