@@ -147,11 +147,11 @@ def summary_row(measure: Measure, rows: list[dict[str, str]]) -> str:
     ours += f" (of {len(seeds)})" if 0 < len(seeds) < 3 else ""
     random, unity = (amount(values[player]) if player in values else "-" for player in FIXED)
 
-    # the seed in the middle, of those that came there
+    # the seed in the middle, the later one of two; one that never came there is the last
     firsts = sorted(first_reached(measure), key=lambda point: point[1])
     when = "-"
     if firsts:
-        decisions, minutes, _ = firsts[(len(firsts) - 1) // 2]
+        decisions, minutes, _ = firsts[min(len(seeds) // 2, len(firsts) - 1)]
         when = f"{decisions / 1e6:.2f} M decisions, {minutes:.1f} min"
         when += "" if len(firsts) == len(seeds) else f" ({len(firsts)} of {len(seeds)} seeds)"
 
