@@ -17,14 +17,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
+from decisions_to import Metrics
 from run_script import run_script
 
+from mappo_unity.diagnosis.evidence import amount
 from mappo_unity.runs.metrics_csv import read_metrics
 
 METRICS = ("return_mean", "episode_length_mean")
-
-Metrics = list[dict[str, int | float]]
-"""Rows of metrics.csv."""
 
 
 def main() -> None:
@@ -45,9 +44,10 @@ def main() -> None:
         if not metrics:
             parser.error(f"{run} does not exist, or holds no metrics yet")
 
-        unknown = [name for name in arguments.metrics if name not in metrics[0]]
+        columns = list(dict.fromkeys(name for row in metrics for name in row))  # those of matches begin later
+        unknown = [name for name in arguments.metrics if name not in columns]
         if unknown:
-            parser.error(f"{path} has no column {', '.join(unknown)}; it has {', '.join(metrics[0])}")
+            parser.error(f"{path} has no column {', '.join(unknown)}; it has {', '.join(columns)}")
 
         print("\n".join(table(run.name, metrics, arguments.window, arguments.metrics)))
 
@@ -66,7 +66,7 @@ def windows(metrics: Metrics, size: float) -> list[Metrics]:
 
 def mean(rows: Metrics, metric: str) -> float:
     """Return a metric's mean over those rows that have a value; nan: none has."""
-    values = [row[metric] for row in rows if not math.isnan(row[metric])]
+    values = [row[metric] for row in rows if not math.isnan(row.get(metric, math.nan))]
     return fmean(values) if values else math.nan
 
 
@@ -77,18 +77,12 @@ def table(name: str, metrics: Metrics, size: float, columns: Sequence[str]) -> l
     lines = [f"| {name} | {' | '.join(ends)} |", f"|---|{'---|' * len(ends)}"]
 
     for metric in columns:
-        cells = [shown(mean(rows, metric)) for rows in parts]
+        means = [mean(rows, metric) for rows in parts]
+        cells = ["-" if math.isnan(value) else amount(value) for value in means]
         lines.append(f"| {metric} | {' | '.join(cells)} |")
 
     minutes = [f"{rows[-1]['wall_s'] / 60:.0f}" for rows in parts]
     return [*lines, f"| minutes | {' | '.join(minutes)} |"]
-
-
-def shown(value: float) -> str:
-    """Return a cell: three digits, or all before the point."""
-    if math.isnan(value):
-        return "-"
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 if __name__ == "__main__":

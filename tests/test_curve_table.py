@@ -58,6 +58,14 @@ def test_a_window_without_a_value_has_a_dash(tmp_path: Path) -> None:
     assert curve_table.table("a", rows, 100, ["return_mean"])[2] == "| return_mean | 1 | 3 | - | 600 | 6 |"
 
 
+def test_a_metric_may_begin_later_and_stand_in_few_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [(100, ""), (200, 0.5), (300, ""), (400, 999.6)]
+    lines = printed(monkeypatch, capsys, 100, write(tmp_path / "a", rows), "--metrics", "return_mean")
+    assert lines.splitlines()[2] == "| return_mean | - | 0.5 | - | 1,000 |"
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -157,4 +157,4 @@ def leaves_one_action(facts: Facts) -> bool:
 
 def amount(value: float) -> str:
     """Return a number for a sentence."""
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
