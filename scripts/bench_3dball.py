@@ -40,6 +40,7 @@ def main() -> None:
         "--seeds", type=int, default=0, help="also train seeds 0 .. N-1 to the end, default options"
     )
     arguments = parser.parse_args()
+
     cfg = compose_config(
         ["env=3DBall", f"seed={arguments.seed}", "log.loggers=[]", "log.progress=false"]
     ).config
@@ -48,11 +49,13 @@ def main() -> None:
         f"torch threads {cfg.num_threads}; {cfg.env.num_areas} areas, batch {cfg.collect.batch_size}, "
         f"hidden {list(cfg.model.hidden)}, minibatch {cfg.ppo.minibatch_size}"
     )
+
     time_to_95(cfg)
     collection(cfg, arguments.repeats)
     measure(cfg, arguments.repeats)
     for seed in range(arguments.seeds):
         whole_run(seed)
+
     print(f"peak resident memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     print(f"load average at the end: {os.getloadavg()[0]:.2f}")
 

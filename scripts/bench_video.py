@@ -49,6 +49,7 @@ def make_video(checkout: Path, scene: str, seconds: float, width: int, height: i
             f"width={width}",
             f"height={height}",
         ]
+
         before = os.times()
         run = subprocess.run(
             [sys.executable, "-c", CODE, *options],
@@ -59,6 +60,7 @@ def make_video(checkout: Path, scene: str, seconds: float, width: int, height: i
         )
         after = os.times()
         run.check_returncode()
+
         frames = re.search(r"(\d+) frames", run.stdout)
         assert frames, run.stdout
         cost_s = after.children_user + after.children_system - before.children_user - before.children_system

@@ -81,9 +81,11 @@ def main() -> None:
     for name in arguments.tasks:
         if name not in TASKS:
             parser.error(f"there is no task {name!r}; there are {', '.join(TASKS)}")
+
     columns = "task", "seed", "frames", "return: start", "end", "best", "goal", "reached at", "rolled back"
     print(f"| {' | '.join([*columns, 's', 'CPU s', 'load'])} |")
     print("|---|---|---|---|---|---|---|---|---|---|---|---|", flush=True)
+
     for name in arguments.tasks or TASKS:
         for seed in arguments.seeds:
             run = Run(name, seed, arguments.frames or TASKS[name].frames, arguments.set)

@@ -24,7 +24,7 @@ import mappo_unity.protocol.protobuf
 
 mappo_unity.protocol.protobuf.install()
 
-from mlagents_envs.base_env import ActionTuple  # noqa: E402
+from mlagents_envs.base_env import ActionTuple, TerminalSteps  # noqa: E402
 from run_script import run_script  # noqa: E402
 
 from mappo_unity.scenes import make_scene  # noqa: E402
@@ -83,28 +83,35 @@ def play(blue: Policy, purple: Policy, episodes: int, seed: int, scene: str = "S
     length = np.zeros(NUM_FIELDS, np.int64)
     played = np.zeros(NUM_FIELDS, np.int64)
     results: list[tuple[int, int]] = []  # winner: 1 blue, -1 purple, 0 none; decisions
+
     while (played < each).any():
         for name, policy in sides.items():
             decisions, terminals = env.get_steps(name)
+
+            # what blue sees of a match is all that is counted of it
             if name.endswith("team=0"):
                 for row in range(0, len(terminals), 2):  # two agents of a team end together
                     field = (int(terminals.group_id[row]) - 1) // 2
                     if played[field] < each:
-                        winner = (
-                            0 if terminals.interrupted[row] else int(np.sign(terminals.group_reward[row]))
-                        )
-                        results.append((winner, int(length[field])))
+                        results.append((winner_of(terminals, row), int(length[field])))
                     played[field] += 1
                     length[field] = 0
                 length[np.unique((decisions.group_id - 1) // 2)] += 1
+
             if len(decisions):
                 env.set_actions(name, ActionTuple(discrete=policy(decisions.obs).astype(np.int32)))
         env.step()
     env.close()
+
     winners, lengths = np.array(results).T
     return Score(
         int((winners > 0).sum()), int((winners == 0).sum()), int((winners < 0).sum()), lengths.mean()
     )
+
+
+def winner_of(terminals: TerminalSteps, row: int) -> int:
+    """Return who has won a match, by the end of one of blue's agents: 1 blue, -1 purple, 0 none."""
+    return 0 if terminals.interrupted[row] else int(np.sign(terminals.group_reward[row]))
 
 
 def report(match: str, seed: int, score: Score, seconds: float) -> None:
@@ -119,6 +126,7 @@ def report(match: str, seed: int, score: Score, seconds: float) -> None:
 
 
 def main() -> None:
+    """Play all matches and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -126,11 +134,13 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--policy", type=Path, default=shared_folder() / "oracle" / "SoccerTwos.onnx")
     args = parser.parse_args()
+
     matches = ["random - random"]
     if args.policy.is_file():
         matches = ["official - random", "random - official", "official - official", *matches]
     else:
         print(f"no policy at {args.policy}: its matches are skipped (--policy, or MAPPO_SHARED)")
+
     print(f"{'blue - purple':28} seed   blue  draws  purple  blue won%  draws%  decisions   CPU s")
     for match in matches:
         for seed in args.seeds:
@@ -140,10 +150,12 @@ def main() -> None:
                 for number, side in enumerate(match.split(" - "))
             )
             report(match, seed, play(blue, purple, args.episodes, seed), time.process_time() - start)
+
     for seed in args.seeds:
         start = time.process_time()
         score = play(random_policy(seed), random_policy(seed + 1), args.episodes, seed, "StrikersVsGoalie")
         report("random strikers - goalie", seed, score, time.process_time() - start)
+
     print("blue won%: of the decided episodes")
 
 

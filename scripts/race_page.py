@@ -128,23 +128,25 @@ def draw(runs: dict[tuple[str, str], dict[str, list[Row]]]) -> None:
     scenes = sorted({scene for scene, _ in runs})
     if not scenes:
         return
+
     columns = min(2, len(scenes))
-    figure, axes = pyplot.subplots(
-        -(-len(scenes) // columns),
-        columns,
-        figsize=(5 * columns, 3.2 * -(-len(scenes) // columns)),
-        layout="constrained",
-        squeeze=False,
-    )
+    rows = -(-len(scenes) // columns)
+    size = 5 * columns, 3.2 * rows
+    figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+
     for axis, scene in zip(axes.flat, scenes):
         for (name, _), by_who in runs.items():
-            for who, rows in by_who.items() if name == scene else ():
-                minutes = [float(row["second"]) / 60 for row in rows]
-                axis.plot(minutes, [float(row["return"]) for row in rows], color=COLORS[who], label=who)
+            for who, points in by_who.items() if name == scene else ():
+                minutes = [float(point["second"]) / 60 for point in points]
+                returns = [float(point["return"]) for point in points]
+                axis.plot(minutes, returns, color=COLORS[who], label=who)
+
+        # a name once, however many seeds
         handles = {label: handle for handle, label in zip(*axis.get_legend_handles_labels())}
         axis.set(title=scene, xlabel="minutes", ylabel="return, last 100 episodes")
         axis.grid(alpha=0.3)
         axis.legend(handles.values(), handles.keys(), fontsize=8)
+
     for axis in axes.flat[len(scenes) :]:
         axis.remove()
     figure.savefig(RACE.with_suffix(".png"), dpi=80)

@@ -111,7 +111,7 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
     load, start = os.getloadavg()[0], time.time()
     seconds = run_for(command, folder / "log", limit_s)
     if scene in COMPETITIVE:
-        return
+        return  # matches tell who plays well
 
     points = embedded_curve(folder, start) if who == EMBEDDED else player_curve(folder, start)
     facts = {
@@ -136,6 +136,7 @@ def play_matches(arguments: argparse.Namespace, scene: str, seed: int, minutes: 
     """Let what the three saved after their minutes play; append a row for each opponent, unless it stands."""
     known = {(row["scene"], int(row["seed"]), row["who"], row["against"]) for row in read_rows(MATCHES)}
     theirs = folder_of(arguments, scene, seed, PEER) / "run" / f"{scene}.onnx"
+
     for who, against in (
         (PEER, "random"),
         (PLAYER, "random"),
@@ -145,11 +146,13 @@ def play_matches(arguments: argparse.Namespace, scene: str, seed: int, minutes: 
     ):
         if (scene, seed, who, against) in known:
             continue
+
         folder = folder_of(arguments, scene, seed, who)
         policy = theirs if who == PEER else folder / "run"
         opponent = theirs if against == PEER else against
         words = f"run={policy}", f"env={scene}", f"opponent={opponent}", f"episodes={NUM_MATCHES}"
         won, stderr = share_won(mappo_eval(*words, "deterministic=false"))
+
         row = {
             "scene": scene,
             "seed": seed,
@@ -194,6 +197,7 @@ def run_for(command: list[Any], log: Path, limit_s: float) -> float:
     """Run a command for so long, then interrupt it; return the seconds that it had."""
     environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     start = time.monotonic()
+
     with open(log, "w") as file:
         process = subprocess.Popen(
             list(map(str, command)),
@@ -205,17 +209,23 @@ def run_for(command: list[Any], log: Path, limit_s: float) -> float:
         )
         try:
             code = process.wait(limit_s)
-            if code:
-                raise SystemExit(f"exit code {code}; the end of {log} says why")
         except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGINT)
-            try:
-                process.wait(60)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+            interrupt(process)
             return limit_s
+
+    if code:
+        raise SystemExit(f"exit code {code}; the end of {log} says why")
     return time.monotonic() - start
+
+
+def interrupt(process: subprocess.Popen) -> None:
+    """End a process as Ctrl-C does, and all of its group where that takes more than a minute."""
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(60)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 def heed_interrupts() -> None:

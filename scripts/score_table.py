@@ -156,6 +156,7 @@ def score(
             figures = said[measure.opponent]
             if figures is None:
                 continue
+
             value, stderr = measure.figure(figures)
             row = {
                 "date": time.strftime("%Y-%m-%d"),

@@ -45,6 +45,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("options", nargs="*", help="further options of mappo-train")
     arguments = parser.parse_args()
+
     troubles = {
         signal.SIGKILL: arguments.kills,
         signal.SIGSTOP: arguments.hangs,
@@ -54,6 +55,7 @@ def main() -> int:
     plan = [int(number) for number, count in troubles.items() for _ in range(count)]
     rng = random.Random(arguments.seed)
     rng.shuffle(plan)
+
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         trainer = start(folder, arguments, len(plan))
@@ -72,23 +74,20 @@ def start(folder: Path, arguments: argparse.Namespace, troubles: int) -> subproc
     command = shlex.join([sys.executable, str(Path(__file__).absolute()), "serve"])
     build.write_text(f'#!/bin/sh\nexec {command} "$@"\n')
     build.chmod(0o755)
-    return subprocess.Popen(
-        [
-            *(sys.executable, "-c", "from mappo_unity.cli import train_main; raise SystemExit(train_main())"),
-            *(
-                "env=3DBall",
-                "env.backend=player",
-                f"env.file_name={build}",
-                f"max_steps={arguments.max_steps}",
-            ),
-            *(
-                f"env.timeout_s={HANG_TIMEOUT_S}",
-                f"env.max_restarts={2 * troubles}",
-                f"seed={arguments.seed}",
-            ),
-            *(f"hydra.run.dir={folder / 'run'}", "log.progress=false", *arguments.options),
-        ]
-    )
+
+    options = [
+        "env=3DBall",
+        "env.backend=player",
+        f"env.file_name={build}",
+        f"env.timeout_s={HANG_TIMEOUT_S}",
+        f"env.max_restarts={2 * troubles}",
+        f"max_steps={arguments.max_steps}",
+        f"seed={arguments.seed}",
+        f"hydra.run.dir={folder / 'run'}",
+        "log.progress=false",
+    ]
+    code = "from mappo_unity.cli import train_main; raise SystemExit(train_main())"
+    return subprocess.Popen([sys.executable, "-c", code, *options, *arguments.options])
 
 
 def disturb(trainer: subprocess.Popen, plan: list[int], every_s: float, rng: random.Random) -> list[int]:
@@ -100,6 +99,7 @@ def disturb(trainer: subprocess.Popen, plan: list[int], every_s: float, rng: ran
         pid = player_of(trainer.pid)
         if pid is None or pid == last:
             continue  # still starting, or not yet replaced
+
         try:
             os.kill(pid, plan[len(done)])
         except ProcessLookupError:
@@ -114,14 +114,16 @@ def player_of(pid: int) -> int | None:
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         for child in task.read_text().split():
             command = Path(f"/proc/{child}/cmdline").read_bytes()
-            if b"--mlagents-port" in command and b"serve" in command:
-                status = Path(f"/proc/{child}/status").read_text()
-                caught = int(
-                    next(line for line in status.splitlines() if line.startswith("SigCgt")).split()[1], 16
-                )
-                if caught >> (signal.SIGUSR2 - 1) & 1:  # its handlers are in place
-                    return int(child)
+            if b"--mlagents-port" in command and b"serve" in command and catches(int(child), signal.SIGUSR2):
+                return int(child)
     return None
+
+
+def catches(pid: int, number: int) -> bool:
+    """Return whether a process has a handler for a signal (Linux)."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    mask = next(line for line in lines if line.startswith("SigCgt")).split()[1]
+    return bool(int(mask, 16) >> (number - 1) & 1)
 
 
 def report(run: Path, code: int, troubles: int) -> int:
@@ -135,6 +137,7 @@ def report(run: Path, code: int, troubles: int) -> int:
         print(f"{name}: {last[name]:,.1f}")
     for name in ("restarts", "dropped_episodes", "dropped_steps"):
         print(f"{name}: {last[name]:,.0f}")
+
     final = checkpoints_in(run)[-1]
     earned = evaluate(final, episodes=100)["mean_return"] if code == 0 else float("nan")
     solved = earned >= 95

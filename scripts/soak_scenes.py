@@ -80,11 +80,13 @@ class RandomPlay:
         fresh = random_actions(name, spec, decisions, self.rng)
         if not hold:
             return fresh
+
         if name not in self.held:
             size, branches = spec.action_spec.continuous_size, spec.action_spec.discrete_size
             self.held[name] = ActionTuple(
                 np.zeros((PLACES, size), np.float32), np.zeros((PLACES, branches), np.int32)
             )
+
         held, place = self.held[name], decisions.agent_id % PLACES
         new = self.rng.random(len(place)) < 1 / HELD
         held.continuous[place[new]] = fresh.continuous[new]
@@ -95,15 +97,19 @@ class RandomPlay:
 def soak(scene: str, hours: float, num_areas: int, seed: int = 0) -> Report:
     """Play a scene for `hours` of its own clock and return what was found."""
     report = Report(scene, num_areas)
+
+    # both warn by a call here instead of a line
     warnings: Counter[str] = Counter()
     mujoco.set_mju_user_warning(lambda message: warnings.update([message.partition(" Time")[0]]))
     before = np.seterr(divide="call", over="call", invalid="call")
     caller = np.seterrcall(lambda kind, flag: warnings.update([f"numpy: {kind}"]))
+
     env = make_scene(scene, seed=seed, num_areas=num_areas)
     ranges = ranges_of(scene)(env)
+    tick_s = TICK_S.get(scene, 0.02)
     start = time.process_time()
     try:
-        _play(env, ranges, report, round(hours * 3600 / TICK_S.get(scene, 0.02)), RandomPlay(seed))
+        _play(env, ranges, report, round(hours * 3600 / tick_s), RandomPlay(seed))
     except FloatingPointError as error:
         ranges.fault("the simulation goes on", str(error))
     finally:
@@ -111,37 +117,45 @@ def soak(scene: str, hours: float, num_areas: int, seed: int = 0) -> Report:
         np.seterrcall(caller)
         mujoco.set_mju_user_warning(None)
         env.close()
+
     for message, count in warnings.items():
         ranges.faults[f"warning: {message}"] = [count, ""]
     if report.growth > MAX_GROWTH:
         ranges.fault("memory growth below 2%", f"{report.growth:.2%} of {report.memory_mb:.0f} MB")
+
     report.cpu_s, report.warnings = time.process_time() - start, warnings.total()
-    report.hours = report.ticks * TICK_S.get(scene, 0.02) / 3600
+    report.hours = report.ticks * tick_s / 3600
     report.resets, report.seen, report.faults = ranges.resets, ranges.seen, ranges.faults
     return report
 
 
 def _play(env: Any, ranges: Any, report: Report, num_ticks: int, play: RandomPlay) -> None:
+    """Play for so many ticks, and count and check what the scene reports."""
+
     def tick() -> None:
         report.ticks += 1
         ranges.tick()
 
     env.after_tick = tick
     env.reset()
-    warm = 0.0
+
+    warm = 0.0  # MB after the warm-up
     while report.ticks < num_ticks:
         hold = report.ticks // MINUTE % 2 == 1
         for name, spec in env.behavior_specs.items():
             decisions, terminals = env.get_steps(name)
             report.episodes += len(terminals)
+
             _check_records(name, terminals, ranges, report)
             if len(decisions):
                 report.decisions += len(decisions)
                 _check_records(name, decisions, ranges, report)
                 env.set_actions(name, play.act(name, spec, decisions, hold))
         env.step()
+
         if not warm and report.ticks >= WARM_UP * num_ticks:
             warm = resident_mb()
+
     report.memory_mb = resident_mb()
     report.growth = report.memory_mb / warm - 1
 
@@ -202,6 +216,7 @@ def main() -> int:
     parser.add_argument("--num-areas", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+
     reports = []
     for scene in options.scenes:
         with multiprocessing.get_context("spawn").Pool(1) as pool:  # memory counts by process
@@ -212,9 +227,11 @@ def main() -> int:
             file=sys.stderr,
             flush=True,
         )
+
     print(table(reports))
     for report in reports:
         print(f"\n{extremes(report)}")
+
     faulty = [report for report in reports if report.faults]
     for report in faulty:
         for rule, (count, case) in report.faults.items():

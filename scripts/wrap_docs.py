@@ -25,6 +25,7 @@ def wrap(text: str, width: int = WIDTH) -> str:
     def flush() -> None:
         if not paragraph:
             return
+
         line = paragraph[0]
         item = ITEM.match(line)
         first = item.group(0) if item else " " * (len(line) - len(line.lstrip(" ")))
@@ -56,6 +57,7 @@ def wrap(text: str, width: int = WIDTH) -> str:
         else:
             in_list = in_list and (bool(paragraph) or line.startswith("  "))
             paragraph.append(stripped if paragraph else line.rstrip())
+
     flush()
     return "\n".join(out) + "\n"
 
