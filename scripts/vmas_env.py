@@ -42,7 +42,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # gym, which vmas needs, warns of its age
     import vmas
     from vmas.simulator.environment import Environment
-    from vmas.simulator.scenario import BaseScenario
+    from vmas_holders import holders_of, items_of
 
 
 def make(seed: int, scenario: str, num_envs: int = 60, max_steps: int = 100, **kwargs: Any) -> BaseEnv:
@@ -92,15 +92,18 @@ class VmasEnv(BaseEnv):
         for option, value in (("num_envs", num_envs), ("max_steps", max_steps)):
             if value < 1:
                 raise ConfigError(f"env.params.{option}={value} is out of range: it must be >= 1")
+
         self._rng: list[Any] = list(Environment.vmas_random_state)
         with self._own_rng():
             self.vmas = vmas.make_env(scenario, num_envs, seed=seed, terminated_truncated=True, **kwargs)
         self.num_envs, self.num_agents, self.max_steps = num_envs, self.vmas.n_agents, max_steps
+
         self._name = f"{scenario}?team=0"
         self._spec = self._read_spec(scenario)
         self._ids = np.arange(num_envs * self.num_agents, dtype=np.int32)
         self._groups = np.repeat(np.arange(1, num_envs + 1, dtype=np.int32), self.num_agents)
         self._zeros = np.zeros(len(self._ids), np.float32)
+
         self.reset()
         self.step()  # some attributes of VMAS' objects begin with the first step; `set_state` wants them
         self.reset()
@@ -126,16 +129,20 @@ class VmasEnv(BaseEnv):
         with self._own_rng():
             obs, rewards, terminated, _, _ = self.vmas.step(list(scaled.unbind(1)))
         self._clock += 1
+
         reward = torch.stack(rewards, 1).flatten().numpy()
         rows, real = self._rows(obs), terminated.numpy()
         over = real | (self._clock >= self.max_steps)
         if not over.any():
             self._ask(rows, reward, TerminalSteps.empty(self._spec))
             return
+
         ended = np.repeat(over, self.num_agents)
         cut = np.repeat(~real, self.num_agents)[ended]
         ids, groups, nothing = self._ids[ended], self._groups[ended], self._zeros[ended]
         terminals = TerminalSteps([rows[ended]], reward[ended], cut, ids, groups, nothing)
+
+        # the next episode begins in the same result
         self._renew(torch.from_numpy(over))
         self._clock[over] = 0
         self._ask(self._rows(self._observe()), np.where(ended, self._zeros, reward), terminals)
@@ -167,8 +174,8 @@ class VmasEnv(BaseEnv):
         VMAS has no snapshots of its own; this holds every tensor with a row for each environment that its
         objects keep. A scenario that remembers anything else is not restored to the bit.
         """
-        generator, (kind, words, *rest), (version, internal, gauss) = self._rng
         decisions, terminals = self._records
+        generator, (kind, words, *rest), (version, internal, gauss) = self._rng
         rng = [generator.numpy().copy(), kind, np.array(words), *rest, version, np.array(internal), gauss]
         return {
             "tensors": {name: holder[key].numpy().copy() for name, holder, key in self._tensors()},
@@ -184,11 +191,12 @@ class VmasEnv(BaseEnv):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go back to a snapshot that `get_state` returned here or in an environment made the same way."""
-        holders = _holders(self.vmas)
+        holders = holders_of(self.vmas)
         for name, value in state["tensors"].items():
             path, _, key = name.rpartition("/")
             holder = holders[path]
             holder[key if isinstance(holder, dict) else int(key)] = torch.from_numpy(np.array(value))
+
         generator, kind, words, *rest, version, internal, gauss = state["rng"]
         self._rng = [
             torch.from_numpy(np.array(generator)),
@@ -196,6 +204,7 @@ class VmasEnv(BaseEnv):
             (version, tuple(int(word) for word in internal), gauss),
         ]
         self._clock = np.array(state["clock"])
+
         ended = np.array(state["ended"])
         terminals = TerminalSteps(
             [np.array(state["end_obs"])],
@@ -218,6 +227,7 @@ class VmasEnv(BaseEnv):
                 f"env.params.scenario={scenario}: its agents differ in observations {sorted(sizes)} or "
                 f"actions {sorted(ranges)}; this wrapper plays scenarios whose agents are all alike"
             )
+
         low, high = ranges.pop()
         self._low, self._high = torch.tensor(low), torch.tensor(high)
         self._middle, self._half = (self._low + self._high) / 2, (self._high - self._low) / 2
@@ -250,14 +260,15 @@ class VmasEnv(BaseEnv):
             self.vmas.reset(return_observations=False)
         if over.all():
             return
+
         for holder, key, old in before:
             new = holder[key]
             holder[key] = torch.where(over.view(-1, *[1] * (new.ndim - 1)), new, old)
 
     def _tensors(self) -> Iterator[tuple[str, Any, Any]]:
         """Go through the tensors ``[E, ...]`` that VMAS' objects keep: (name, dict or list, key in it)."""
-        for path, holder in _holders(self.vmas).items():
-            for key, value in _items(holder):
+        for path, holder in holders_of(self.vmas).items():
+            for key, value in items_of(holder):
                 if isinstance(value, Tensor) and value.ndim and len(value) == self.num_envs:
                     yield f"{path}/{key}", holder, key
 
@@ -284,30 +295,3 @@ class VmasEnv(BaseEnv):
             raise UnityActionException(
                 f"there is no behavior {behavior_name!r}; this environment has {self._name!r}"
             )
-
-
-def _holders(root: Environment) -> dict[str, Any]:
-    """Return the dicts and lists in which VMAS' objects keep their values, by the shortest way there."""
-    found: dict[str, Any] = {"": vars(root)}
-    seen = {id(vars(root))}
-    waiting = list(found.items())
-    for path, holder in waiting:
-        for key, value in _items(holder):
-            inside = value if isinstance(value, dict | list) else _attributes(value)
-            if inside is not None and id(inside) not in seen:
-                seen.add(id(inside))
-                found[f"{path}/{key}"] = inside
-                waiting.append((f"{path}/{key}", inside))
-    return found
-
-
-def _items(holder: Any) -> list[tuple[Any, Any]]:
-    """Return keys and values; dicts keyed by objects (forces) are VMAS' notes within a step."""
-    if isinstance(holder, dict):
-        return [(key, value) for key, value in holder.items() if isinstance(key, str)]
-    return list(enumerate(holder))
-
-
-def _attributes(value: Any) -> dict[str, Any] | None:
-    ours = isinstance(value, BaseScenario) or type(value).__module__.startswith("vmas.")
-    return vars(value) if ours and hasattr(value, "__dict__") else None
