@@ -180,9 +180,37 @@ class LeftBehind(matrix_game.MatrixGame):
         return decision, terminal
 
 
-def test_matches_that_begin_with_the_reset_of_a_used_environment_do_not_count():
+class WithSnapshots(LeftBehind):
+    """The same with snapshots, and a count of its steps."""
+
+    steps = 0
+
+    def step(self):
+        self.steps += 1
+        super().step()
+
+    def get_state(self):
+        return {"is_used": self.is_used}
+
+    def set_state(self, state):
+        self.is_used, self.stale, self.played = state["is_used"], False, False
+
+
+@pytest.mark.parametrize("game", [LeftBehind, WithSnapshots])
+def test_matches_that_begin_with_the_reset_of_a_used_environment_do_not_count(game):
     policy = RandomPolicy(0)
-    scores = play_matches(lambda seed: LeftBehind(seed, games=4), policy, policy, 16, seed=0)
+    scores = play_matches(lambda seed: game(seed, games=4), policy, policy, 16, seed=0)
     assert {side: (score.wins, score.losses) for side, score in scores.items()} == dict.fromkeys(
         matrix_game.SIDES, (8, 0)
     )
+
+
+def test_both_sides_begin_at_a_snapshot_where_there_are_some():
+    made = []
+
+    def make(seed):
+        made.append(WithSnapshots(seed, games=4))
+        return made[-1]
+
+    play_matches(make, RandomPolicy(0), RandomPolicy(1), 16, seed=0)
+    assert [env.steps for env in made] == [4]  # two for the 8 matches of each side, none is played in vain

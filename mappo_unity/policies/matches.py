@@ -72,6 +72,9 @@ def play_matches(
 ) -> dict[str, Score]:
     """Play ``matches`` matches, half of them with the sides swapped.
 
+    Both halves begin alike where the environment has snapshots. Another one goes on from where the first half
+    has left it, and what its reset begins then does not count.
+
     Returns:
         The policy's score as each side, under the names of the side's behaviors.
 
@@ -80,15 +83,20 @@ def play_matches(
     """
     scores: dict[str, Score] = {}
 
-    env = make_env(seed)
+    env: Any = make_env(seed)
     try:
         sides = find_sides(env)
+        start = env.get_state() if hasattr(env, "get_state") else None
         for index, side in enumerate(sides):
+            if index and start is not None:
+                env.set_state(start)
+
             own, other = sides[side], [b for s, names in sides.items() if s != side for b in names]
             policies = dict.fromkeys(own, policy) | dict.fromkeys(other, opponent)
             # Of an odd number of matches the first side gets one more.
             count = (matches + 1 - index) // 2
-            scores["+".join(own)] = play_side(env, policies, own, max(1, count), is_used=index > 0)
+            is_used = index > 0 and start is None
+            scores["+".join(own)] = play_side(env, policies, own, max(1, count), is_used)
     finally:
         env.close()
 
