@@ -32,6 +32,7 @@ from mappo_unity.scenes.contract.rules import (
     MAX_SILENT_STEPS,
     check_plain,
     check_same_specs,
+    has_snapshots,
     note_silence,
     silence_error,
 )
@@ -129,12 +130,11 @@ class UnityEnv(EnvBase):
 
     def get_state(self) -> dict[str, Any] | None:
         """Return a snapshot between two rounds, or None if the BaseEnv cannot give one."""
-        snapshot = getattr(self.base_env, "get_state", None)
-        if snapshot is None or not hasattr(self.base_env, "set_state"):
+        if not has_snapshots(self.base_env):
             return None
 
         return {
-            "scene": snapshot(),
+            "scene": self.base_env.get_state(),
             "behaviors": {name: behavior.get_state() for name, behavior in self._behaviors.items()},
         }
 

@@ -22,6 +22,7 @@ from mappo_unity.keys import policy_name
 from mappo_unity.policies.episodes import play
 from mappo_unity.policies.layouts import check_two_sides
 from mappo_unity.policies.policy import Policy
+from mappo_unity.scenes.contract.rules import has_snapshots
 
 Z95 = 1.959964  # two-sided 95 % quantile of the standard normal distribution
 
@@ -86,7 +87,7 @@ def play_matches(
     env: Any = make_env(seed)
     try:
         sides = find_sides(env)
-        start = env.get_state() if hasattr(env, "get_state") else None
+        start = env.get_state() if has_snapshots(env) else None
         for index, side in enumerate(sides):
             if index and start is not None:
                 env.set_state(start)

@@ -36,6 +36,11 @@ class ContractError(AssertionError):
     details: tuple[str, ...] = ()
 
 
+def has_snapshots(env: Any) -> bool:
+    """Return whether a BaseEnv can be brought back to where it was: by `get_state` and `set_state`."""
+    return hasattr(env, "get_state") and hasattr(env, "set_state")
+
+
 def check_specs(specs: Any) -> None:
     """Check the behaviors that an environment shows; there may be none yet.
 
