@@ -7,10 +7,11 @@ the scene embedded. A run that ends by itself (max_steps) is over earlier. Retur
 those that the player itself notes; embedded ones are those of metrics.csv. Where teams play against each
 other no return tells who plays well: what each has saved then plays matches, against random players and
 against what mlagents-learn has saved. With --patience it trains on for so many times the minutes (not where
-teams play), to show when it comes to the target; what the three earn is compared after MINUTES.
+teams play), to show when it comes to the target; what the three earn is compared after MINUTES. With --who
+only some of the three train: where teams play, that gives one of them other minutes than the others had.
 
     python scripts/race_peer.py --peer VENV/bin/mlagents-learn --official ml-agents/config \\
-        --scenes 3DBall=3 Basic=3 [--patience 1] [--seeds 0] [--out outputs/race]
+        --scenes 3DBall=3 Basic=3 [--patience 1] [--seeds 0] [--who mlagents-learn] [--out outputs/race]
     python scripts/race_peer.py --draw          # only the table docs/benchmarks/race.md and the picture
 
 What was measured stands in docs/benchmarks/race.csv and race_matches.csv, and is not run again.
@@ -32,7 +33,7 @@ from typing import Any
 
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
 from peer_command import add_peer_options, check_peer_options, their_command
-from race_page import EMBEDDED, MATCHES, PEER, PLAYER, RACE, WINDOW, write_page
+from race_page import EMBEDDED, MATCHES, NAMES, PEER, PLAYER, RACE, WINDOW, write_page
 from recorded_player import make_player
 from run_script import run_script
 from score_measures import share_won
@@ -55,6 +56,7 @@ def main() -> None:
         "--patience", type=patience_of, default=1.0, help="how many times MINUTES mlagents-learn gets"
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--who", nargs="+", choices=NAMES, default=NAMES, help="who trains")
     parser.add_argument("--out", type=Path, default=Path("outputs/race"))
     arguments = parser.parse_args()
     if arguments.scenes:
@@ -64,7 +66,7 @@ def main() -> None:
         for seed in arguments.seeds:
             # who begins changes, as the machine's load does
             order = [PEER, PLAYER, EMBEDDED] if seed % 2 == 0 else [EMBEDDED, PLAYER, PEER]
-            for who in order:
+            for who in (name for name in order if name in arguments.who):
                 waits = who == PEER and scene not in COMPETITIVE  # matches are of what the same minutes gave
                 race(arguments, scene, seed, who, 60 * minutes * (arguments.patience if waits else 1))
             if scene in COMPETITIVE:
@@ -100,10 +102,9 @@ def _number(word: str) -> float:
 
 def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s: float) -> None:
     """Let one train for its time, unless that has been done, and append its curve."""
-    known = read_rows(RACE) + read_rows(MATCHES)
-    if any((row["scene"], row["who"], int(row["seed"])) == (scene, who, seed) for row in known):
+    if is_known(scene, seed, who, limit_s / 60):
         return
-    folder = folder_of(arguments, scene, seed, who)
+    folder = folder_of(arguments, scene, seed, who, limit_s / 60)
     shutil.rmtree(folder, ignore_errors=True)  # of a run that was cut off
     folder.mkdir(parents=True)
 
@@ -126,16 +127,24 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
     print(scene, who, seed, facts, points[-1:], flush=True)
 
 
-def folder_of(arguments: argparse.Namespace, scene: str, seed: int, who: str) -> Path:
-    """Return where one of the three trains."""
+def is_known(scene: str, seed: int, who: str, minutes: float) -> bool:
+    """Return whether what one of the three came to stands in a file: its curve, or matches after minutes."""
+    rows = [row for row in read_rows(MATCHES) if float(row["minutes"]) == minutes]
+    rows += read_rows(RACE)
+    return any((row["scene"], int(row["seed"]), row["who"]) == (scene, seed, who) for row in rows)
+
+
+def folder_of(arguments: argparse.Namespace, scene: str, seed: int, who: str, minutes: float) -> Path:
+    """Return where one of the three trains for its minutes."""
     out: Path = arguments.out
-    return out.resolve() / f"{scene}-{who.replace(' ', '_')}-{seed}"
+    return out.resolve() / f"{scene}-{who.replace(' ', '_')}-{seed}-{minutes:g}"
 
 
 def play_matches(arguments: argparse.Namespace, scene: str, seed: int, minutes: float) -> None:
-    """Let what the three saved after their minutes play; append a row for each opponent, unless it stands."""
-    known = {(row["scene"], int(row["seed"]), row["who"], row["against"]) for row in read_rows(MATCHES)}
-    theirs = folder_of(arguments, scene, seed, PEER) / "run" / f"{scene}.onnx"
+    """Let what was saved after the minutes play; append a row for each opponent, unless it stands."""
+    facts = ("scene", "seed", "who", "against", "minutes")
+    known = {tuple(row[fact] for fact in facts) for row in read_rows(MATCHES)}
+    theirs = folder_of(arguments, scene, seed, PEER, minutes) / "run" / f"{scene}.onnx"
 
     for who, against in (
         (PEER, "random"),
@@ -144,10 +153,12 @@ def play_matches(arguments: argparse.Namespace, scene: str, seed: int, minutes: 
         (EMBEDDED, "random"),
         (EMBEDDED, PEER),
     ):
-        if (scene, seed, who, against) in known:
+        # with --who there may be nobody to play, or to play against
+        there = who in arguments.who and (against == "random" or against in arguments.who)
+        if not there or (scene, str(seed), who, against, f"{minutes:g}") in known:
             continue
 
-        folder = folder_of(arguments, scene, seed, who)
+        folder = folder_of(arguments, scene, seed, who, minutes)
         policy = theirs if who == PEER else folder / "run"
         opponent = theirs if against == PEER else against
         words = f"run={policy}", f"env={scene}", f"opponent={opponent}", f"episodes={NUM_MATCHES}"

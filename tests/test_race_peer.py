@@ -22,9 +22,9 @@ def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> argparse.Names
     """Return the arguments of a race of SoccerTwos whose three runs lie in a folder."""
     for module in (race_page, race_peer):
         monkeypatch.setattr(module, "MATCHES", tmp_path / "race_matches.csv")
-    arguments = argparse.Namespace(out=tmp_path)
+    arguments = argparse.Namespace(out=tmp_path, who=race_page.NAMES)
     for who in (race_peer.PEER, race_peer.PLAYER, race_peer.EMBEDDED):
-        run = race_peer.folder_of(arguments, "SoccerTwos", 0, who) / "run"
+        run = race_peer.folder_of(arguments, "SoccerTwos", 0, who, 10.0) / "run"
         run.mkdir(parents=True)
         if who == race_peer.PEER:
             (run.parent / "episodes.csv").write_text("40,0,1,5.0\n250000,0,1,9.0\n")
@@ -47,8 +47,8 @@ def test_what_was_saved_plays_random_players_and_the_peer_once(arguments, monkey
 
     monkeypatch.setattr(race_peer, "mappo_eval", evaluate)
     race_peer.play_matches(arguments, "SoccerTwos", 0, 10.0)
-    theirs = arguments.out / "SoccerTwos-mlagents-learn-0/run/SoccerTwos.onnx"
-    ours = [arguments.out / f"SoccerTwos-preset_{how}-0/run" for how in ("through_the_player", "embedded")]
+    theirs = arguments.out / "SoccerTwos-mlagents-learn-0-10/run/SoccerTwos.onnx"
+    ours = [arguments.out / f"SoccerTwos-preset_{how}-0-10/run" for how in ("through_the_player", "embedded")]
     wanted = [(theirs, "random"), *((run, against) for run in ours for against in ("random", theirs))]
     assert [words[0::2][:2] for words in played] == [(f"run={run}", f"opponent={a}") for run, a in wanted]
 
