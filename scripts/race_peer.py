@@ -256,11 +256,16 @@ def player_curve(folder: Path, start: float) -> list[tuple[float, int, float]]:
 
 
 def embedded_curve(folder: Path, start: float) -> list[tuple[float, int, float]]:
-    """Return the same from metrics.csv; what a run does beside its iterations is put before them."""
-    path = folder / "run/metrics.csv"
-    rows = [row for row in read_metrics(path) if row["episodes"] >= WINDOW]
-    beside_s = path.stat().st_mtime - start - rows[-1]["wall_s"] if rows else 0.0
-    return [(row["wall_s"] + beside_s, int(row["agent_steps"]), row["return_mean"]) for row in rows]
+    """Return the same from metrics.csv, with the times at which TensorBoard's file noted the rows."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    rows = [row for row in read_metrics(folder / "run/metrics.csv") if row["episodes"] >= WINDOW]
+    events = EventAccumulator(str(folder / "run/tensorboard"), size_guidance={"scalars": 0})  # 0: all
+    events.Reload()
+    noted = {event.step: event.wall_time for event in events.Scalars("return_mean")}
+    return [
+        (noted[int(row["agent_steps"])] - start, int(row["agent_steps"]), row["return_mean"]) for row in rows
+    ]
 
 
 if __name__ == "__main__":

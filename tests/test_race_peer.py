@@ -16,6 +16,9 @@ import race_page
 import race_peer
 from peer_command import their_command
 
+MEASURES = ("won_of_decided", "won_of_decided_low95", "won_of_decided_high95")
+"""What an evaluation says about matches."""
+
 
 @pytest.fixture
 def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
@@ -114,3 +117,42 @@ def test_a_scene_comes_with_its_minutes(word):
     assert race_peer.minutes_of("Basic=3") == ("Basic", 3.0)
     with pytest.raises(argparse.ArgumentTypeError, match="must be SCENE=MINUTES, such as 3DBall=3"):
         race_peer.minutes_of(word)
+
+
+def test_embedded_returns_stand_at_the_seconds_when_they_were_written_down(tmp_path):
+    from torch.utils.tensorboard import SummaryWriter
+
+    run = tmp_path / "run"
+    run.mkdir()
+    with SummaryWriter(str(run / "tensorboard")) as writer:
+        for at_s, steps, value in ((1005.0, 100, 0.1), (1007.5, 200, 0.5), (1009.0, 300, 0.9)):
+            writer.add_scalar("return_mean", value, steps, walltime=at_s)
+    (run / "metrics.csv").write_text(
+        "agent_steps,wall_s,episodes,return_mean\n100,1,40,0.1\n200,3.5,120,0.5\n300,5,180,0.9\n"
+    )
+
+    # the first has too few episodes for a mean; what comes after the last row is not counted
+    curve = race_peer.embedded_curve(tmp_path, 1000.0)
+    assert curve == [(7.5, 200, 0.5), (9.0, 300, 0.9)]
+
+
+def test_one_may_train_alone_for_minutes_of_its_own(arguments, monkeypatch):
+    played: list[str] = []
+    monkeypatch.setattr(
+        race_peer,
+        "mappo_eval",
+        lambda *words: played.append(words[0]) or dict.fromkeys(MEASURES, 0.6),
+    )
+    race_peer.play_matches(arguments, "SoccerTwos", 0, 10.0)
+    assert len(played) == 5
+    assert race_peer.is_known("SoccerTwos", 0, race_peer.PEER, 10.0)
+    assert not race_peer.is_known("SoccerTwos", 0, race_peer.PEER, 42.0)
+
+    arguments.who = [race_peer.PEER]
+    longer = race_peer.folder_of(arguments, "SoccerTwos", 0, race_peer.PEER, 42.0)
+    longer.mkdir()
+    (longer / "episodes.csv").write_text("40,0,1,5.0\n900000,0,1,9.0\n")
+    race_peer.play_matches(arguments, "SoccerTwos", 0, 42.0)
+    assert played[5:] == [f"run={longer / 'run/SoccerTwos.onnx'}"], "nobody else has trained for so long"
+    row = "| SoccerTwos | 0 | 42 | random | 60.0 % (0.0), 0.90 M | - | - |"
+    assert row in race_page.matches_table()
