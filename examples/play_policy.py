@@ -28,7 +28,8 @@ def main(scene_name: str, where: str, num_episodes: int = 20) -> float:
             # Agents whose episode has just ended; team rewards stand beside the individual ones.
             for agent, reward, shared in zip(terminal.agent_id, terminal.reward, terminal.group_reward):
                 returns.append(running.pop((name, int(agent)), 0.0) + float(reward + shared))
-            policy.end(name, terminal.agent_id)
+            policy.end(name, terminal.agent_id.tolist())
+            policy.forget(name, terminal.agent_id.tolist())  # what it remembers is of the episode that ended
 
             # Agents that request a decision now.
             for agent, reward, shared in zip(decision.agent_id, decision.reward, decision.group_reward):

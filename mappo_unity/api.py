@@ -67,6 +67,9 @@ def load_policy(where: str | Path, deterministic: bool = True, seed: int = 0) ->
         action = policy.act("3DBall?team=0", decision, env.behavior_specs["3DBall?team=0"])
         env.set_actions("3DBall?team=0", action)
 
+    Before `act` tell it which agents' episodes have ended, with `policy.end(behavior, agent_ids)` and
+    `policy.forget(behavior, agent_ids)`: one with a memory would carry it on into the next episode.
+
     Args:
         where: run folder (its best checkpoint), checkpoint, ONNX file, folder of ONNX files, or "random".
         deterministic: take the most likely action instead of a sampled one.

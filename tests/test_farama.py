@@ -31,7 +31,9 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from mappo_unity import gym_env, make_scene, parallel_env, vector_env
 from mappo_unity.cli import player_main
 from mappo_unity.errors import ConfigError
+from mappo_unity.farama import session
 from mappo_unity.farama.session import Session
+from mappo_unity.scenes.contract.rules import EnvironmentDataError
 
 SCENES = ["3DBall", "Basic", "DungeonEscape", "PushBlock", "SoccerTwos", "WallJump"]
 
@@ -311,6 +313,50 @@ def test_mistakes() -> None:
         env.step(np.zeros((1, 2)))
     with pytest.raises(ConfigError, match="3DBal"):
         parallel_env("3DBal")
+
+
+class Empty(Hybrid):
+    """A game in which nobody asks again."""
+
+    closed = False
+
+    def step(self) -> None:
+        self.result = self.ask([]), TerminalSteps.empty(HYBRID)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.mark.parametrize("make", [parallel_env, vector_env])
+def test_an_environment_in_which_nobody_asks_again_is_told(make: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(session, "MAX_SILENT_STEPS", 20)
+    env = make(Empty())
+    env.reset()
+    actions = dict.fromkeys(env.agents, GO) if make is parallel_env else env.action_space.sample()
+    with pytest.raises(EnvironmentDataError, match="no agent asked for a decision in 20 environment steps"):
+        env.step(actions)
+
+
+def test_what_was_opened_here_is_closed_where_it_cannot_be_played(monkeypatch: Any) -> None:
+    inner = Empty()
+    monkeypatch.setattr(inner, "reset", lambda: inner.step())
+    monkeypatch.setattr(session, "make_env_function", lambda cfg: lambda seed: inner)
+    monkeypatch.setattr(session, "MAX_SILENT_STEPS", 20)
+    with pytest.raises(EnvironmentDataError, match="nobody|no behavior with an agent"):
+        parallel_env("3DBall")
+    assert inner.closed
+
+
+def test_options_are_read_as_typed_on_a_command_line(monkeypatch: Any) -> None:
+    seen: list[Any] = []
+
+    def make(cfg: Any) -> Any:
+        seen.append(cfg)
+        return lambda seed: Hybrid()
+
+    monkeypatch.setattr(session, "make_env_function", make)
+    parallel_env("unity", "env.file_name=builds/Game (1), new")
+    assert [cfg.file_name for cfg in seen] == ["builds/Game (1), new"]
 
 
 def test_the_package_needs_neither() -> None:

@@ -10,7 +10,7 @@ from mlagents_envs.base_env import DecisionSteps, TerminalSteps
 from pettingzoo import ParallelEnv
 
 from mappo_unity.errors import ConfigError
-from mappo_unity.farama.session import Session
+from mappo_unity.farama.session import Session, check_silence
 from mappo_unity.farama.spaces import BehaviorSpaces
 from mappo_unity.keys import policy_name
 
@@ -104,7 +104,10 @@ class AgentsEnv(ParallelEnv):
             ConfigError: an action is not in its space.
         """
         tick = _Tick()
+        silent = 0
         while self.agents and not (tick.ended or tick.asked):
+            check_silence(silent)
+            silent += 1
             records = self._session.step(self._actions(actions))
             actions = {}  # for the first of these steps only
 

@@ -8,11 +8,18 @@ from mlagents_envs.base_env import ActionTuple, BaseEnv, DecisionSteps, Terminal
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.parameters.values import params_at
-from mappo_unity.config.schema import Backend
+from mappo_unity.config.renamed import rename_lines
+from mappo_unity.config.schema import Backend, Config
+from mappo_unity.config.text_lines import literal_lines
 from mappo_unity.envs.backends import MakeEnv, make_env_function
 from mappo_unity.envs.opening import First, first_results
 from mappo_unity.errors import ConfigError
-from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_same_specs
+from mappo_unity.scenes.contract.rules import (
+    MAX_SILENT_STEPS,
+    check_same_specs,
+    note_silence,
+    silence_error,
+)
 
 
 class Session:
@@ -33,8 +40,10 @@ class Session:
         self._seed = seed
 
         if isinstance(env, str):
-            cfg = compose_config([f"env={env}", *options]).config.env
-            is_given = any(line.startswith("env.num_areas=") for line in options)
+            # as a command line goes: today's names first, then texts as they were typed
+            lines = literal_lines(rename_lines(list(options)), Config, False)
+            cfg = compose_config([f"env={env}", *lines]).config.env
+            is_given = any(line.startswith("env.num_areas=") for line in lines)
             if num_areas is not None and not is_given and cfg.backend is not Backend.custom:
                 cfg.num_areas = num_areas
             cfg.params = params_at(cfg.params, {}, missing=-1)  # whoever trains elsewhere has no lessons
@@ -49,7 +58,12 @@ class Session:
             self.name, self._env = type(env).__name__, env
 
         self._is_fresh = False
-        self.first = self._reset()
+        try:
+            self.first = self._reset()
+        except BaseException:
+            if self._make is not None:  # nobody else could end a player that was started here
+                self._env.close()
+            raise
         self._is_fresh = True
 
     def begin(self, seed: int | None) -> Mapping[str, First]:
@@ -89,3 +103,10 @@ class Session:
         self._env.reset()
         self._is_fresh = False
         return first_results(self._env, MAX_SILENT_STEPS)
+
+
+def check_silence(steps: int) -> None:
+    """Say once that nobody has anything to do for long; raise EnvironmentDataError after far longer."""
+    note_silence(steps, MAX_SILENT_STEPS)
+    if steps >= MAX_SILENT_STEPS:
+        raise silence_error(steps)

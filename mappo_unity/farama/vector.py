@@ -10,7 +10,7 @@ from gymnasium.vector.utils import batch_space
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.errors import ConfigError
-from mappo_unity.farama.session import Session
+from mappo_unity.farama.session import Session, check_silence
 from mappo_unity.farama.spaces import BehaviorSpaces
 
 Result = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
@@ -77,7 +77,10 @@ class AgentsVectorEnv(VectorEnv):
         terminated, truncated, asked = np.zeros((3, self.num_envs), bool)
         final: dict[int, Any] = {}
 
+        silent = 0
         while not asked.any():
+            check_silence(silent)
+            silent += 1
             sent = {name: self._rows_of(name, d, actions) for name, d in self._requests.items() if len(d)}
             records = self._session.step(sent)
 
