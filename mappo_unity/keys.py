@@ -17,7 +17,7 @@ import re
 
 OBS = "observation"  # float32 [..., A, O]: vector sensors, concatenated in the order of the specs
 SENSOR = "obs_{}"  # [..., A, *sensor shape]: sensor i before concatenation; float32, uint8 of a `ByteImage`
-ACTION = "action"  # see models.ActionLayout
+ACTION = "action"  # see learning.networks.distributions.ActionLayout
 LOG_PROB = "action_log_prob"  # float32 [..., A]
 LOG_PROBS = "action_log_probs"  # float32 [..., A, C + K]: of each component, where ppo.ratio=component
 MASK = "action_mask"  # bool [..., A, sum of branches]: True = allowed (Unity's sense, turned round)

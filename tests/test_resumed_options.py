@@ -12,7 +12,16 @@ from test_self_play import matrix_game
 from test_train import BATCH, TINY, options, rows
 
 from mappo_unity.cli import train_main
-from mappo_unity.config.schema import Backend, CuriosityConfig, EnvConfig, Optimizer, PPOConfig, RewardsConfig
+from mappo_unity.config.schema import (
+    Backend,
+    CollectConfig,
+    CuriosityConfig,
+    EnvConfig,
+    Optimizer,
+    PPOConfig,
+    RatioKind,
+    RewardsConfig,
+)
 from mappo_unity.policies.onnx_policy import OnnxPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import NewFolder, create_folder, discard_folder
@@ -51,6 +60,19 @@ def test_a_run_that_goes_back_keeps_its_new_checkpoints(tmp_path: Path, capsys: 
     path, _ = checkpoint.newest_good(tmp_path)
     train(cfg, tmp_path, path)
     assert names(tmp_path) == last and not (best.parent / "abandoned_2").exists()
+
+
+def test_decisions_that_are_pending_do_not_outlive_another_ratio(tmp_path: Path) -> None:
+    probe = EnvConfig("custom", Backend.custom, factory="probes:make", params={"probe": "Staggered"})
+    cfg = options(8, env=probe, collect=CollectConfig(rounds=7), export_onnx=False)
+    train(cfg, tmp_path, after_iteration=stop_after(1))
+    path, _ = checkpoint.newest_good(tmp_path)
+    (saved,) = checkpoint.load(path)["learners"].values()
+    assert saved["carried"] is not None, "its agents ask at their own pace"
+
+    other = replace(cfg, ppo=replace(cfg.ppo, ratio=RatioKind.component))
+    outcome = train(other, tmp_path, path)
+    assert outcome.agent_steps >= cfg.max_steps
 
 
 def test_the_best_checkpoint_keeps_its_opponents(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from test_train import assert_same, options, rows, start, wait_for_rows, without
 
 from mappo_unity import keys
 from mappo_unity.cli import eval_main, train_main
+from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import (
     Backend,
     CollectConfig,
@@ -223,6 +224,34 @@ def test_what_opponents_do_neither_counts_nor_is_learnt_nor_moves_a_normaliser(t
     # the episodes of those who learn alone: a batch holds as many decisions, one an episode
     first = rows(tmp_path / "run")[0]
     assert int(first["episodes_new"]) == int(first["agent_steps"]) == 2 * GAMES * 4
+
+
+def test_a_side_that_does_not_learn_takes_no_turns(tmp_path):
+    lines = ["env=StrikersVsGoalie", "env.num_areas=4", "max_steps=360", "collect.batch_size=120"]
+    lines += ["behaviors.Goalie.train=false", "self_play.save_steps=120", "self_play.team_change=120"]
+    lines += ["self_play.play_against_latest_model_ratio=0", "model.hidden=[8]", "matches.interval=null"]
+    seen = []
+
+    def note(state):
+        players = state.setup.opponents.following
+        seen.append({name: own.unique().tolist() for name, own in players.items()})
+
+    train(compose_config(lines).config, tmp_path / "run", after_iteration=note)
+    # the strikers learn in every match, against the one goalie there is
+    assert seen == [{"Goalie": [LEARNER], "Striker": [LEARNER]}] * len(seen) and len(seen) >= 3
+
+
+def test_opening_rivals_draws_no_number_of_training(tmp_path):
+    cfg = matrix_game(1)
+    other = train(cfg, tmp_path / "other").last_checkpoint
+    cfg.self_play.fixed = [str(other)]
+
+    def look(state):
+        before = torch.get_rng_state()
+        assert str(other) in state._rivals()
+        assert torch.equal(torch.get_rng_state(), before)
+
+    train(cfg, tmp_path / "run", after_iteration=look)
 
 
 def test_elo_moves_as_in_ml_agents(tmp_path):

@@ -192,6 +192,17 @@ def test_a_network_travels_once():
     assert lineups.next(behind=False).networks.keys() == {0}
 
 
+def test_what_a_new_worker_has_not_got_travels_again():
+    lineups = Lineups()
+    for number in (0, 1):
+        lineups.decide(lineup([[number]], [number], kept=[0, 1]))
+        assert lineups.next(behind=False).networks.keys() == {number}
+
+    lineups.forget()  # a worker was replaced, and told `sent`
+    lineups.decide(lineup([[0], [1]], [0, 1], kept=[0, 1]))
+    assert lineups.next(behind=False).networks.keys() == {0}
+
+
 def test_the_lineup_of_a_batch_that_was_on_its_way_comes_before_the_one_that_was_decided():
     before = Lineups()
     before.decide(lineup([[0]], [0], kept=[0]))

@@ -58,7 +58,8 @@ class CarriedRounds:
             own = entries[keys.REWARD]
             entries[keys.REWARD] = own.sum(-2, keepdim=True).expand_as(own)
         rounds = TensorDict(entries, batch.batch_size)
-        if self.rounds is None:
+        # with another ppo.ratio or model.memory, which a resume may bring, what is pending cannot be learnt
+        if self.rounds is None or self.rounds.keys() ^ rounds.keys():
             return rounds
 
         for key, entry in self.rounds.items():

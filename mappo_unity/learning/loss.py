@@ -30,7 +30,7 @@ from mappo_unity.learning.value_norm import ValueNorm
 ACTOR_LEARNS = "actor_learns"  # bool [rows, A, 1]: it acted, and the outcome is known; absent: all
 CRITIC_LEARNS = "critic_learns"  # bool [rows, A, 1]: the same, or it departed while a team mate acted
 PROXIMAL = "proximal_log_prob"  # float32 [rows, A, n]: under the policy that the update began with
-BASELINE = "baseline"  # float32 [rows, A, 1]: what a POCA critic said before the update, normalised
+BASELINE = "baseline"  # float32 [rows, A, V]: what a POCA critic said before the update, normalised
 TEAM = "team"  # with recurrent memory: the critic's inputs of the whole team, [B, L, A, *]
 MEMBER = "member"  # with recurrent memory: int64 [B], the slot of the team whose decisions the sequence holds
 MOST_WEIGHT = 100.0  # an importance weight at most (imp_samp_max in Hilton et al.'s code, openai/ppo-ewma)

@@ -107,7 +107,8 @@ def clip_gradients(optimizer: torch.optim.Optimizer, cfg: PPOConfig) -> Tensor:
         groups = [[parameter for group in groups for parameter in group]]
 
     norms = [nn.utils.clip_grad_norm_(group, limit, foreach=True) for group in groups]
-    return norms[0] if len(norms) == 1 else torch.stack(norms).norm()
+    # that of a group without gradients, an actor's while its critic warms up, is a number on the CPU
+    return norms[0] if len(norms) == 1 else torch.stack([norm.to(norms[-1].device) for norm in norms]).norm()
 
 
 class CriticWarmup:

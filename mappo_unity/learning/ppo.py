@@ -126,6 +126,7 @@ class PolicyLearner:
             metrics |= self.update(buffer) if buffer is not None else {}
             metrics |= self.rewards.learn()
             self.prepared = None
+            self.rows.forget()
         if self.cloning is not None:
             metrics |= self.cloning.learn(int(batch.get(keys.ACTING).sum()), settings["lr"], progress)
         if not self.round_norms:

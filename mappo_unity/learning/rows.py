@@ -58,6 +58,9 @@ class TeamRows:
         pieces = rows.split(max(1, _PIECE // rounds.shape[-1]))
         rounds.set(key, torch.cat([read(piece) for piece in pieces]).view(*rounds.shape, -1))
 
+    def forget(self) -> None:
+        """Keep nothing of a batch."""
+
     def take(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return what the loss reads."""
         if not self._shuffles:
@@ -82,6 +85,10 @@ class SequenceRows:
         self._critic_keys = critic_keys
         self._keys = [key for key in row_keys if key not in (keys.MEMORY, keys.PRESENT, keys.DEPARTED)]
         self._rounds: dict[str, Tensor] = {}  # [T, G, A, ...] of all sides
+
+    def forget(self) -> None:
+        """Let go of the rounds of the last batch, images too, which has been learnt."""
+        self._rounds = {}
 
     def of(self, rounds: TensorDict, view: DecisionView) -> tuple[TensorDictBase, Tensor]:
         """Return where the sequences stand, and how many decisions each holds, int64 ``[B]``."""

@@ -1,7 +1,8 @@
 """Decisions of one agent in a row: what a network with a memory learns on.
 
-A sequence never crosses an end, nor a batch's beginning; it starts from the state that the memory really had
-then. What is shorter than `ppo.sequence_length` is padded at its end, and the padding is masked.
+A sequence never crosses an end; decisions that the batch before left pending stand before those of this one.
+It starts from the state that the memory really had then. What is shorter than `ppo.sequence_length` is padded
+at its end, and the padding is masked.
 """
 
 from __future__ import annotations

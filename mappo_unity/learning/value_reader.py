@@ -23,12 +23,12 @@ from mappo_unity.learning.value_norm import ValueNorm
 
 @dataclass
 class Values:
-    """Values in the reward's scale; R = carried rounds + rounds of the batch."""
+    """Values in the reward's scale, of V reward streams; R = carried rounds + rounds of the batch."""
 
-    value: Tensor  # [R, ..., A, 1]
-    end: Tensor  # [R, ..., A, 1]: of terminal observations, where an episode was cut off; 0 elsewhere
-    final: Tensor  # [..., A, 1]: of the row after the last
-    baseline: Tensor | None = None  # [R, ..., A, 1], of a POCA critic
+    value: Tensor  # [R, ..., A, V]
+    end: Tensor  # [R, ..., A, V]: of terminal observations, where an episode was cut off; 0 elsewhere
+    final: Tensor  # [..., A, V]: of the row after the last
+    baseline: Tensor | None = None  # [R, ..., A, V], of a POCA critic
     states: dict[str, Tensor] = field(default_factory=dict)  # [R, ..., A, M], before each row
 
 

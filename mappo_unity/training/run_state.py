@@ -176,13 +176,13 @@ class RunState:
 
     def _rivals(self) -> dict[str, Policy]:
         """Return whom a policy may meet in a series beside random: opponents of self-play, the run's best."""
-        rivals = self.self_play.rivals(self._layout()) if self.self_play is not None else {}
-        best = self._folder / checkpoint.FOLDER / checkpoint.BEST
-        if best.exists():
-            # building a network draws weights, of which training is to feel nothing
-            with torch.random.fork_rng(devices=[]):
+        # building a network draws weights, of which training is to feel nothing
+        with torch.random.fork_rng(devices=[]):
+            rivals = self.self_play.rivals(self._layout()) if self.self_play is not None else {}
+            best = self._folder / checkpoint.FOLDER / checkpoint.BEST
+            if best.exists():
                 policy = CheckpointPolicy(best, deterministic=False)
-            rivals.setdefault(step_name(policy.agent_steps), policy)
+                rivals.setdefault(step_name(policy.agent_steps), policy)
         return rivals
 
     def score(self) -> float:

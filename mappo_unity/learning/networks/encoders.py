@@ -36,7 +36,7 @@ class ObsLayout:
     `sets`: sensors of variable length, ``[N, F]``: up to N entities of F features.
     `goal_vectors`: which columns of the vectors are goal signals, as pairs of first and behind the last.
     `goal_keys`: which images and sets are.
-    `traces`, `traced`: decays of a critic's `ObservationTraces`, and the vectors' columns that it traces.
+    `traces`, `traced`: decays of a network's `ObservationTraces`, and the vectors' columns that it traces.
     """
 
     vector: int

@@ -92,7 +92,7 @@ class IntrinsicStream:
         reward.mul_(float(self.returns.inv_std))
 
     def learn(self, decisions: Transitions, cfg: PPOConfig) -> dict[str, float]:
-        """Teach the model these decisions, in the policy's epochs and minibatches; return metrics."""
+        """Teach the model these decisions, in minibatches of `ppo.minibatch_size`; return metrics."""
         if not self.left:
             return {}
 

@@ -74,6 +74,10 @@ class Lineups:
         """The lineup of the newest request, with all its networks, for a worker that is replaced."""
         return self._sent
 
+    def forget(self) -> None:
+        """Take note of a worker that begins anew, with the networks of `sent` and no others."""
+        self._known &= self._sent.networks.keys() if self._sent is not None else set()
+
     @property
     def numbers(self) -> set[int]:
         """The numbers of all that play in the newest request, or in the one behind."""

@@ -209,6 +209,7 @@ class RemoteWorkers(SeveralWorkers):
         except BaseException:
             process.end()
             raise
+        self._lineups.forget()
         return process
 
     def _count_losses(self, batch: Batch, number: int) -> None:

@@ -25,7 +25,7 @@ from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.rng import get_rng_state, set_rng_state
 from mappo_unity.training.collection.batches import Batch, BatchCollector
 from mappo_unity.training.collection.description import Description, describe
-from mappo_unity.training.collection.lineups import Lineup, Network, line_up
+from mappo_unity.training.collection.lineups import Lineup, Network, fits_teams, line_up
 
 WORKER_STRIDE = 1_000_003
 """Worker n of several starts from the run's seed plus n times this (modulo 2^31)."""
@@ -137,7 +137,12 @@ class Worker:
         if state["env"] is not None:
             self._memories = dict(state["memories"])
             self.env.set_state(to_arrays(state["env"]))
-        self._opponents, self._rng = state.get("opponents"), state.get("rng")
+
+        opponents = state.get("opponents")
+        # of other teams, which a player may show in new episodes, nothing is known
+        if opponents is not None and fits_teams(opponents["following"], [self.env]):
+            self._opponents = opponents
+        self._rng = state.get("rng")
 
     def close(self) -> None:
         """Close the environment."""

@@ -12,6 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Any
 
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.lock import locked
 from mappo_unity.training.child_process import start_child
@@ -50,9 +51,16 @@ class SearchResult:
 
 
 def run_search(plan: SearchPlan, told: Told) -> SearchResult:
-    """Run the trials that are left of a search; raise ConfigError where another process is at it."""
+    """Run the trials that are left of a search.
+
+    Raises:
+        ConfigError: its folder cannot be made, or another process is at it.
+    """
     folder = plan.folder
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"out={folder} cannot be made ({error.strerror}: {error.filename})") from error
     patience, number = SweepSignalHandler(), None
 
     with locked(folder, f"the search in {folder} is being run"):

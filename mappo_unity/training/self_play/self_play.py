@@ -62,6 +62,8 @@ class SelfPlay:
         self._in_workers = cfg.collect.workers > 0  # who plays there is followed here
         self._sides = _two_sides(cfg, setup)
         self._names = [name for name in setup.learners if name not in setup.frozen]
+        policies = {side: set(map(keys.policy_name, own)) for side, own in sorted(self._sides.items())}
+        self._learners = [side for side, own in policies.items() if own & {*self._names}]
         assert setup.opponents is not None
         self._opponents: Opponents = setup.opponents
 
@@ -73,7 +75,8 @@ class SelfPlay:
         }
         self._saved_at = self._drawn_at = self._changed_at = 0
         self._draws = 0
-        self._learning = None if self._cfg.team_change is None else min(self._sides)
+        takes_turns = self._cfg.team_change is not None or len(self._learners) == 1  # the other stands still
+        self._learning = self._learners[0] if takes_turns else None
 
     def begin(self, agent_steps: int, about: Mapping[str, Any]) -> None:
         """Take the first snapshot and draw opponents, where self-play begins; count all intervals from there.
@@ -100,18 +103,17 @@ class SelfPlay:
         Returns:
             Metrics, and whether the other side learns from now on: the environment is to be reset.
         """
-        metrics = self._count(batch)
-        cfg = self._cfg
+        metrics, cfg = self._count(batch), self._cfg
         if self._in_workers:
             for name in self._setup.learners:
                 self._opponents.playing[name] = batch.rounds.get((name, keys.PLAYER))[-1, ..., 0, 0].clone()
 
         if cfg.save_steps is not None and agent_steps - self._saved_at >= cfg.save_steps:
             self._save(agent_steps, about)
-        changed = cfg.team_change is not None and agent_steps - self._changed_at >= cfg.team_change
+        period = cfg.team_change if len(self._learners) > 1 else None
+        changed = period is not None and agent_steps - self._changed_at >= period
         if changed:
-            order = sorted(self._sides)
-            self._learning = next(side for side in order if side != self._learning)
+            self._learning = next(side for side in self._learners if side != self._learning)
             self._changed_at = agent_steps
         if changed or agent_steps - self._drawn_at >= cfg.swap_steps:
             self._drawn_at = agent_steps
@@ -129,10 +131,9 @@ class SelfPlay:
         rivals = {where: open_policy(where, False, self._seed, OPTION) for where in named}
         for number in self._pool.numbers:
             name = step_name(self._pool.steps(number))
-            learners = self._setup.learners
             actors = {
                 policy: make_player(learner.actor, self._network(policy, number))
-                for policy, learner in learners.items()
+                for policy, learner in self._setup.learners.items()
             }
             rivals[name] = ActorPolicy(layout, actors, False, name)
         return rivals
@@ -268,7 +269,7 @@ class SelfPlay:
         self._draws = int(state["draws"])
         self._saved_at, self._drawn_at, self._changed_at = (int(at) for at in state["at"])
         self.elo |= {name: float(elo) for name, elo in state["elo"].items() if name in self.elo}
-        if self._learning is not None and state["learning"] is not None:
+        if self._learning is not None and state["learning"] in self._learners:
             self._learning = int(state["learning"])
         elif self._learning is not None:  # sides take turns from now on
             self._changed_at = agent_steps
