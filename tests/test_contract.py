@@ -17,6 +17,7 @@ from mlagents_envs.base_env import (
     BaseEnv,
     BehaviorSpec,
     DecisionSteps,
+    DimensionProperty,
     TerminalSteps,
 )
 
@@ -120,6 +121,10 @@ STARTS = [
     (
         {NAME: BehaviorSpec([vector_spec(0)], ACTION)},
         r"obs_0 \(vector\) has shape \(0,\); it must be a tuple",
+    ),
+    (
+        {NAME: BehaviorSpec([SENSOR._replace(dimension_property=DimensionProperty.NONE)], ACTION)},
+        r"obs_0 \(vector\) has dimension_property .*; it must be a tuple",
     ),
     ({NAME: BehaviorSpec([SENSOR], None)}, "action_spec is None; it must be an ActionSpec"),
     ({NAME: BehaviorSpec([SENSOR], ActionSpec(0, ()))}, "has no action"),

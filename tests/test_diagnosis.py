@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from mappo_unity.diagnosis.evidence import Evidence
 from mappo_unity.diagnosis.survey import RETURNS, PolicySurvey, Survey
 from mappo_unity.diagnosis.survey_file import read_survey
 from mappo_unity.envs.rounds import Episode
+from mappo_unity.policies.layouts import describe_spec
 from mappo_unity.reports.reading import Run, default_options, read_run
 
 QUICK = ["clipped", "same_for_all", "never_asked"]
@@ -276,9 +278,22 @@ def test_what_the_environment_sends() -> None:
     assert found({"decisions": 4999, "slots": {"all": 32, "idle": 32}}) == [], "too early to say"
     assert found({"rewards": FACTS["rewards"] | {"nonzero": 0}}) == ["no reward"]
 
+    two = {"Probe": FACTS, "Other": FACTS | {"decisions": 0}}
+    assert kinds(Evidence(run_of(), two)) == ["never asked"]
+    two["Other"]["opposed"] = True
+    assert kinds(Evidence(run_of(), two)) == [], "its side learns later, opponents play its teams"
+
     ends = {"elements": FACTS["elements"] | {"clipped": [1], "clipped_share": 0.5}}
     assert found(ends) == ["clipped"]
     assert found(ends | {"vectors": [["RayPerceptionSensor", 2]]}) == [], "a ray that meets nothing"
+
+
+def test_a_spec_of_numpy_numbers_is_surveyed(tmp_path: Path) -> None:
+    sensor = vector_spec(3)._replace(shape=(np.prod([3, 1]),))
+    spec = BehaviorSpec([sensor], ActionSpec(np.int32(0), (np.int64(2),)))
+    facts = Survey({"Probe": spec}, {"Probe": ["Probe"]}).as_dict()
+    assert json.loads(json.dumps(facts))["Probe"]["branches"] == [2]
+    assert json.loads(json.dumps(describe_spec(spec, 1)))["sensors"] == [[3]]
 
 
 def test_what_slows_a_run_down() -> None:

@@ -147,6 +147,24 @@ def test_an_agent_of_two_behaviors_is_found() -> None:
         lives.ask("Small", steps)
 
 
+def test_an_agent_may_leave_its_group_before_it_ends() -> None:
+    lives = Lives()
+    spec = Ball3D.BEHAVIORS[0].spec()
+    asks, ends = DecisionSteps.empty(spec), TerminalSteps.empty(spec)
+    for steps, group in ((asks, 2), (ends, 0)):
+        steps.agent_id, steps.group_id = np.array([3]), np.array([group])
+    lives.begin_result()
+    lives.ask("Crew", asks)
+    lives.begin_result()
+    lives.end("Crew", ends)  # as Unity's UnregisterAgent and EndEpisode send it
+
+    lives.begin_result()
+    lives.ask("Crew", asks)
+    ends.group_id = np.array([5])
+    with pytest.raises(ContractError, match="ended in group 5, but its decisions were in 2"):
+        lives.end("Crew", ends)
+
+
 def test_masks_are_obeyed_and_a_full_mask_is_an_error() -> None:
     spec = Ball3D.BEHAVIORS[0].spec()._replace()
     spec = spec._replace(action_spec=spec.action_spec.create_discrete((3,)))

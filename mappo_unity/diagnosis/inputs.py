@@ -22,6 +22,8 @@ def from_inputs(evidence: Evidence) -> Iterator[Finding]:
         return
 
     for name, facts in evidence.survey.items():
+        if not facts["decisions"] and facts.get("opposed"):
+            continue  # it is not its turn yet: opponents play all of its teams
         if not facts["decisions"]:
             yield Finding(
                 "never asked",

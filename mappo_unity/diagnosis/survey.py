@@ -38,22 +38,24 @@ class PolicySurvey:
     """
 
     def __init__(self, spec: BehaviorSpec) -> None:
-        self._branches = list(spec.action_spec.discrete_branches)
+        # plain numbers, as JSON knows them: a spec of one's own may hold NumPy's
+        self._branches = [int(size) for size in spec.action_spec.discrete_branches]
         self._acted: np.ndarray | None = None  # rounds in which each slot's agent asked, and was there
         self._there: np.ndarray | None = None
         self._looks = 0
         self._every = 1  # episode of which the return is kept
 
-        vectors = [(s.name, s.shape[0]) for s in spec.observation_specs if len(s.shape) == 1]
+        vectors = [(s.name, int(s.shape[0])) for s in spec.observation_specs if len(s.shape) == 1]
         self.facts: dict[str, Any] = {
             "branches": self._branches,
-            "continuous": spec.action_spec.continuous_size,
+            "continuous": int(spec.action_spec.continuous_size),
             "vectors": vectors,
             "decisions": 0,
             "rewards": {"count": 0, "nonzero": 0, "at_ends": 0, "least": 0.0, "greatest": 0.0},
             "episodes": {"count": 0, "of_one_decision": 0, "least": None, "greatest": None},
             "returns": [],
             "slots": {"all": 0, "idle": 0},
+            "opposed": False,  # whether an opponent has ever played its agents
             "elements": None,
             "images": {},
             "same_for_all": None,
@@ -72,6 +74,7 @@ class PolicySurvey:
         # an opponent's agents are asked, too, but ACTING says nothing of them
         played = rounds.get(keys.PLAYER, None)
         ours = present if played is None else present & (played.flatten(1).cpu().numpy() == keys.LEARNER)
+        self.facts["opposed"] |= bool(np.count_nonzero(present) > np.count_nonzero(ours))
 
         # slots may become more while a run goes on
         if self._acted is None or len(self._acted) != acting.shape[1]:

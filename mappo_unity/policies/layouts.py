@@ -29,7 +29,8 @@ def describe_spec(spec: BehaviorSpec, team_size: int) -> dict[str, Any]:
     """Return what a network must fit: sensor shapes, actions, team size."""
     return {
         "team_size": team_size,
-        "sensors": [list(o.shape) for o in spec.observation_specs],
+        # plain numbers, which a checkpoint gives back: a spec of one's own may hold NumPy's
+        "sensors": [[int(n) for n in o.shape] for o in spec.observation_specs],
         CHANNELS: [channel_dim(o) for o in spec.observation_specs],
         GOALS: [is_goal(o) for o in spec.observation_specs],
         "continuous": int(spec.action_spec.continuous_size),

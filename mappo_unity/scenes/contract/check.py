@@ -105,7 +105,7 @@ def _check_shown(specs: Any) -> None:
         names = [sensor.name for sensor in spec.observation_specs]
         require(len(set(names)) == len(names), f"{name}: sensor names repeat: {names}")
         for sensor in spec.observation_specs:
-            flags, sizes = len(sensor.dimension_property), len(sensor.shape)
+            flags, sizes = len(sensor.dimension_property or ()), len(sensor.shape)
             require(
                 flags == sizes, f"{name}, sensor {sensor.name}: {flags} dimension properties, not {sizes}"
             )

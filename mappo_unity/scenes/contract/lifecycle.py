@@ -46,8 +46,9 @@ class Lives:
                 known.behavior == name,
                 f"{name}, agent {agent}: ended here, but its last decision was in {known.behavior}",
             )
+            # Unity's UnregisterAgent takes an agent out of its group before it ends
             require(
-                known.group_id == group_id,
+                group_id in (known.group_id, 0),
                 f"{name}, agent {agent}: ended in group {group_id}, but its decisions were in "
                 f"{known.group_id}",
             )

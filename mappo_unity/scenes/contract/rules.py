@@ -197,6 +197,12 @@ def _check_spec(name: str, spec: BehaviorSpec) -> None:
                 f"behavior {name!r}: sensor {sensor_name(spec, index)} has shape {shape!r}; it must be a "
                 "tuple of whole numbers >= 1, such as (8,)"
             )
+        flags = sensor.dimension_property
+        if flags is not None and not isinstance(flags, LISTS):
+            raise EnvironmentDataError(
+                f"behavior {name!r}: sensor {sensor_name(spec, index)} has dimension_property {flags!r}; it "
+                "must be a tuple with a DimensionProperty for each dimension of its shape"
+            )
 
     if not isinstance(actions, ActionSpec):
         raise EnvironmentDataError(
