@@ -475,6 +475,7 @@ def test_evaluation_prints_a_table_and_one_line_of_json(
         (["run=nowhere"], "run=nowhere does not exist"),
         (["run=nowhere", "episodes=x"], "episodes=x does not fit: episodes must be a whole number"),
         (["run=a", "episodes=0"], "episodes=0 is out of range"),
+        (["run=a", "opponent=random", "episodes=1"], "episodes=1 must be >= 2 with an opponent"),
         (["run=a", "episods=3"], "did you mean episodes"),
     ],
 )

@@ -159,6 +159,10 @@ def test_a_small_real_league(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
     assert league_main([*words, "matches=4", f"out={out}"]) == 2
     assert "holds another league, which differs in matches" in capsys.readouterr().err
+    # a pair's seeds are those of its place
+    assert league_main([*words[::-1], "matches=2", f"out={out}"]) == 2
+    assert "holds another league, which differs in its policies (" in capsys.readouterr().err
+    assert len((out / MATCHES).read_text().splitlines()) == 1 + 3 * 2
     with pytest.raises(ConfigError, match=r"plays as .* and as .*best.pt: name each policy once"):
         check_league(LeagueConfig([str(run), str(run / "checkpoints" / "best.pt")]))
 

@@ -1,5 +1,6 @@
 """mappo-learn: what ML-Agents' files and flags become, mistakes in them, and a run from end to end."""
 
+import json
 import os
 import re
 from pathlib import Path
@@ -16,6 +17,7 @@ from mappo_unity.config.mlagents.read import read_settings
 from mappo_unity.config.mlagents.translate import translate
 from mappo_unity.config.per_behavior import behavior_config, init_source
 from mappo_unity.errors import ConfigError
+from mappo_unity.runs import results
 from mappo_unity.runs.behavior_events import mlagents_tags
 from mappo_unity.runs.metrics_csv import read_metrics
 
@@ -519,6 +521,36 @@ def test_a_run_is_not_overwritten_but_resumed_and_replaced(trained, tmp_path, mo
     assert learn_main(["my.yaml", "--run-id=first", "--force", "--seed=6", *SMALL, "max_steps=240"]) == 0
     assert [row["agent_steps"] for row in read_metrics(run / "metrics.csv")] == [240]
     assert os.listdir("results") == ["first"]
+
+
+def test_a_replacement_that_was_killed_at_once_costs_no_run(tmp_path):
+    run = tmp_path / "first"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "checkpoints" / "step_240.pt").write_text("good")
+    (run / "config.yaml").write_text("")
+
+    # SIGKILL before the first checkpoint: the old run lies aside, and what was begun in its place
+    run.rename(tmp_path / ".first.replaced")
+    run.mkdir()
+    (run / "config.yaml").write_text("")
+
+    with pytest.raises(ConfigError), results.replaced(run, force=True):
+        raise ConfigError("a mistake that shows only now")
+    assert (run / "checkpoints" / "step_240.pt").read_text() == "good"
+    assert os.listdir(tmp_path) == ["first"]
+
+
+def test_a_behavior_of_two_words_has_its_file(tmp_path):
+    checkpoint = tmp_path / "checkpoints" / "step_40.pt"
+    checkpoint.parent.mkdir()
+    for stem in ("My_Behavior", "Other"):
+        checkpoint.with_name(f"final_{stem}.onnx").write_text(stem)
+
+    written = results.publish(tmp_path, checkpoint, ["My Behavior", "Other"], 1.0, 40)
+    assert [path.name for path in written] == ["My_Behavior.onnx", "Other.onnx"]
+    assert (tmp_path / "My_Behavior" / "My_Behavior-40.onnx").read_text() == "My_Behavior"
+    status = json.loads((tmp_path / "run_logs" / "training_status.json").read_text())
+    assert status["My Behavior"]["final_checkpoint"]["file_path"] == str(tmp_path / "My_Behavior.onnx")
 
 
 def test_another_run_begins_with_its_networks(trained, tmp_path, monkeypatch):

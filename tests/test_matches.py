@@ -8,6 +8,8 @@ from mlagents_envs.base_env import ActionSpec, BaseEnv, DecisionSteps, TerminalS
 
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.errors import ConfigError
+from mappo_unity.policies import evaluate as evaluation
+from mappo_unity.policies.evaluate import evaluate
 from mappo_unity.policies.matches import Score, count, find_sides, play_matches, points, wilson
 from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.scenes import make_scene
@@ -203,6 +205,29 @@ def test_matches_that_begin_with_the_reset_of_a_used_environment_do_not_count(ga
     assert {side: (score.wins, score.losses) for side, score in scores.items()} == dict.fromkeys(
         matrix_game.SIDES, (8, 0)
     )
+
+
+class SecondLater(matrix_game.MatrixGame):
+    """A game whose second side is asked one step later than the first, as in a game of turns."""
+
+    def get_steps(self, behavior_name):
+        decision, terminal = super().get_steps(behavior_name)
+        if behavior_name == matrix_game.SIDES[1] and not self.played:
+            return DecisionSteps.empty(self.specs[behavior_name]), terminal
+        return decision, terminal
+
+
+def test_a_side_that_moves_later_has_its_matches_too():
+    scores = play_matches(lambda seed: SecondLater(seed, games=4), Always(0), Always(1), 16, seed=0)
+    assert {side: score.matches for side, score in scores.items()} == dict.fromkeys(matrix_game.SIDES, 8)
+
+
+def test_a_policy_and_its_opponent_draw_numbers_of_their_own(monkeypatch):
+    opened = []
+    monkeypatch.setattr(evaluation, "play_matches", lambda make, *players: opened.extend(players) or {})
+    evaluate("random", 2, seed=7, opponent="random", env="SoccerTwos")
+    own, other = (player.rng.random(4).tolist() for player in opened[:2])
+    assert own == np.random.default_rng(7).random(4).tolist() != other
 
 
 def test_both_sides_begin_at_a_snapshot_where_there_are_some():

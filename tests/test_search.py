@@ -154,6 +154,7 @@ def test_values_become_lines_that_mappo_train_reads() -> None:
         (["search=space.yaml", "-m"], ["-m is not an option"]),
         (["search=space.yaml", "env=Nope"], ["env=Nope does not exist"]),
         (["search=space.yaml", "out=space.yaml"], ["out=space.yaml is a file"]),
+        (["search=space.yaml", "out=space.yaml/x"], ["out=space.yaml/x cannot be made (Not a directory"]),
         (["search=space.yaml", "out=."], ["out=. is not empty and holds no search", "give a new folder"]),
     ],
 )

@@ -5,9 +5,10 @@ from __future__ import annotations
 import io
 import json
 
+import pytest
 from rich.console import Console
 
-from mappo_unity.cli.summaries import eval_table, json_line
+from mappo_unity.cli.summaries import console, eval_table, json_line
 
 RESULT = {
     "policy": "best.pt",
@@ -46,6 +47,14 @@ def test_a_path_is_whole_in_a_narrow_terminal() -> None:
     Console(file=text, width=60).print(eval_table({"policy": path, "agent_steps": 204800}))
     values = [line.split("│")[2].strip() for line in text.getvalue().splitlines() if line.count("│") == 3]
     assert "".join(values) == f"{path}204,800"
+
+
+def test_brackets_and_colons_of_a_user_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    console().print(
+        eval_table({"policy": "runs/[a]/[/b].pt", "opponent": "[random]", "env.params": {":cat:": 1}})
+    )
+    printed = capsys.readouterr().out
+    assert all(text in printed for text in ("runs/[a]/[/b].pt", "[random]", "env.params.:cat:"))
 
 
 def test_programs_read_the_same_names_as_before() -> None:

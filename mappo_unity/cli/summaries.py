@@ -38,9 +38,12 @@ _PIPE_WIDTH = 160  # columns of a table that nobody's terminal limits
 
 
 def console() -> Console:
-    """Return a console on standard output, wide where it is no terminal."""
-    plain = Console(highlight=False)
-    return plain if plain.is_terminal else Console(highlight=False, width=_PIPE_WIDTH)
+    """Return a console on standard output, wide where it is no terminal; what it prints has no markup."""
+    # [a.demo] and :name: in a user's options are no tags and no pictures
+    plain = Console(highlight=False, markup=False, emoji=False)
+    if not plain.is_terminal:
+        plain.width = _PIPE_WIDTH
+    return plain
 
 
 def run_summary(outcome: Outcome, folder: Path) -> list[str]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from mappo_unity.config.parameters.samplers import Sampler
@@ -56,7 +57,7 @@ def evaluate(
     head: dict[str, Any] = {"policy": str(played), "deterministic": deterministic, "seed": seed}
     head |= _more_head(policy, options)
     if opponent is not None:
-        other = open_policy(opponent, deterministic, seed, "opponent")
+        other = open_policy(opponent, deterministic, opponent_seed(seed), "opponent")
         scores = play_matches(make_env, policy, other, episodes, seed)
         return head | {"opponent": opponent} | match_figures(scores)
 
@@ -69,6 +70,11 @@ def evaluate(
     # The figures of a single behavior stand at the top, those of several below their names.
     behaviors = {name: summarize(rows) for name, rows in finished.items()}
     return head | (next(iter(behaviors.values())) if len(behaviors) == 1 else {"behaviors": behaviors})
+
+
+def opponent_seed(seed: int) -> int:
+    """Return the opponent's seed: with ours it would draw the numbers that ours draws, and play alike."""
+    return int(np.random.SeedSequence([seed, 1]).generate_state(1)[0]) % 2**31
 
 
 def _more_head(policy: Policy, env: EnvConfig) -> dict[str, Any]:

@@ -14,15 +14,22 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from mlagents_envs.base_env import BaseEnv
 
 from mappo_unity.envs.backends import MakeEnv
+from mappo_unity.envs.opening import first_results
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.keys import policy_name
 from mappo_unity.policies.episodes import play
 from mappo_unity.policies.layouts import check_two_sides
 from mappo_unity.policies.policy import Policy
-from mappo_unity.scenes.contract.rules import has_snapshots
+from mappo_unity.scenes.contract.rules import (
+    MAX_SILENT_STEPS,
+    has_snapshots,
+    note_silence,
+    silence_error,
+)
 
 Z95 = 1.959964  # two-sided 95 % quantile of the standard normal distribution
 
@@ -105,13 +112,14 @@ def play_matches(
 
 
 def find_sides(env: BaseEnv) -> dict[int, list[str]]:
-    """Return the behaviors of each side; behaviors appear with the first reset.
+    """Return the behaviors of each side; they appear with the first agents that request a decision.
 
     Raises:
         ConfigError: there are not two sides.
+        EnvironmentDataError: nobody requests a decision.
     """
     env.reset()
-    return check_two_sides(env.behavior_specs)
+    return check_two_sides({name: first.spec for name, first in first_results(env, MAX_SILENT_STEPS).items()})
 
 
 def play_side(
@@ -124,12 +132,28 @@ def play_side(
     """
     name = own[0]
     env.reset()
-    groups = env.get_steps(name)[0].group_id
-    # Group 0 is none: without teams the match of an agent is its own episode.
-    members = max(1, int((groups == groups[0]).sum())) if groups[0] > 0 else 1
+    members = count_members(env, name)
     # Each member of a team has an agent episode of its own in every match.
-    episodes = play(env, policies, matches * members, only=name, skip_first=is_used)[name]
-    return count(episodes, members if groups[0] > 0 else None)
+    episodes = play(env, policies, matches * (members or 1), only=name, skip_first=is_used)[name]
+    return count(episodes, members)
+
+
+def count_members(env: BaseEnv, behavior: str) -> int | None:
+    """Return how many agents of a behavior make a team; None: there are no teams.
+
+    Of an environment that was reset; where the other side moves first it is stepped until this one may.
+
+    Raises:
+        EnvironmentDataError: it never may.
+    """
+    for steps in range(MAX_SILENT_STEPS):
+        groups = env.get_steps(behavior)[0].group_id
+        if len(groups):
+            # group 0 is none: without teams the match of an agent is its own episode
+            return int(np.bincount(groups).max()) if groups[0] > 0 else None
+        note_silence(steps, MAX_SILENT_STEPS)
+        env.step()
+    raise silence_error(MAX_SILENT_STEPS)
 
 
 def count(episodes: list[Episode], members: int | None) -> Score:

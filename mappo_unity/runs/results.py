@@ -16,6 +16,7 @@ from typing import Any
 
 import yaml
 
+from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.checkpoint_file import FOLDER
@@ -64,16 +65,24 @@ def replaced(folder: Path, force: bool) -> Iterator[None]:
     with locked(folder):
         pass
     old = folder.with_name(f".{folder.name}.replaced")
-    shutil.rmtree(old, ignore_errors=True)
-    folder.rename(old)
+    if old.is_dir() and not _has_trained(folder):
+        shutil.rmtree(folder)  # of a replacement that was killed before it had learnt anything
+    else:
+        shutil.rmtree(old, ignore_errors=True)
+        folder.rename(old)
+
     try:
         yield
     finally:
-        if any((folder / FOLDER).glob("*.pt")):
+        if _has_trained(folder):
             shutil.rmtree(old, ignore_errors=True)
         else:
             shutil.rmtree(folder, ignore_errors=True)
             old.rename(folder)
+
+
+def _has_trained(folder: Path) -> bool:
+    return any((folder / FOLDER).glob("*.pt"))
 
 
 def write_configuration(folder: Path, configuration: Mapping[str, Any]) -> None:
@@ -102,12 +111,13 @@ def publish(
 
     written, status = [], {}
     for policy in policies:
-        found = [checkpoint.with_name(name) for name in (f"final_{policy}{_SUFFIX}", f"final{_SUFFIX}")]
+        stem = keys.file_stem(policy)  # a behavior may be called "My Behavior"
+        found = [checkpoint.with_name(name) for name in (f"final_{stem}{_SUFFIX}", f"final{_SUFFIX}")]
         source = next((path for path in found if path.is_file()), None)
         if source is None:  # no ONNX file could be written, which has been said
             continue
 
-        newest, named = folder / f"{policy}{_SUFFIX}", folder / policy / f"{policy}-{steps}{_SUFFIX}"
+        newest, named = folder / f"{stem}{_SUFFIX}", folder / stem / f"{stem}-{steps}{_SUFFIX}"
         named.parent.mkdir(exist_ok=True)
         for path in (newest, named):
             write_atomically(path, source.read_bytes())

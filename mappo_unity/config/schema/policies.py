@@ -29,6 +29,11 @@ class EvalConfig:
     def __post_init__(self) -> None:
         not_empty(run=self.run, opponent=self.opponent, env=self.env)
         at_least("episodes", self.episodes, 1)
+        if self.opponent is not None and self.episodes < 2:
+            raise ConfigError(
+                f"episodes={self.episodes} must be >= 2 with an opponent: half of the matches are played as "
+                "each side"
+            )
         within("seed", self.seed, 0, 2**31 - 1)
 
 

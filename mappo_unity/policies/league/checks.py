@@ -190,6 +190,9 @@ def _check_folder(league: League) -> None:
 
     wanted = json.loads(_text(league.record()))
     differing = [name for name in wanted if saved.get(name) != wanted[name]]
+    # a pair's number, which its seeds come from, is its place among the policies as they are named
+    if "policies" not in differing and list(saved["policies"]) != list(wanted["policies"]):
+        differing.insert(0, "policies")
     if differing:
         names = " and ".join(map(_named, differing))
         raise ConfigError(
