@@ -18,7 +18,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -106,13 +106,19 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def thin(points: Sequence[Point], most: int) -> list[Point]:
-    """Return some of a curve's points, evenly, and the last one: about as many as `most`."""
+def thin(
+    points: Sequence[Point], most: int, is_reached: Callable[[Point], bool] | None = None
+) -> list[Point]:
+    """Return some of a curve's points, evenly, about as many as `most`, and the last one.
+
+    `is_reached`: whether a point is at the target; the first one that is stays, too, since a page says when
+    that was.
+    """
     step = max(1, math.ceil(len(points) / most))
-    places = list(range(0, len(points), step))
-    if places and places[-1] != len(points) - 1:
-        places.append(len(points) - 1)
-    return [points[place] for place in places]
+    places = {*range(0, len(points), step), *range(len(points))[-1:]}
+    if is_reached is not None:
+        places |= set([place for place, point in enumerate(points) if is_reached(point)][:1])
+    return [points[place] for place in sorted(places)]
 
 
 def append(path: Path, row: dict[str, object]) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from score_measures import measures_of
 from mappo_unity.config.compose import compose_config, load_config
 from mappo_unity.diagnosis.evidence import amount
 from mappo_unity.policies.export import export_checkpoint
-from mappo_unity.policies.policy_files import ZOO, ZOO_FOLDER, choose_checkpoint
+from mappo_unity.policies.policy_files import ZOO_FOLDER, choose_checkpoint
 from mappo_unity.runs.metrics_csv import read_metrics
 
 CARDS = ZOO_FOLDER / "zoo.csv"
@@ -64,15 +65,21 @@ def main() -> None:
 def add(run: Path, episodes: int | None) -> list[dict[str, Any]]:
     """Put the policies of a run into the zoo; return their cards."""
     config = load_config(run / "config.yaml")
-    exported = export_checkpoint(choose_checkpoint(run), ZOO_FOLDER)
-    sizes = {file.policy: file.path.stat().st_size for file in exported}
-    for policy, size in sizes.items():
-        if size > LARGEST_BYTES:
-            raise SystemExit(f"{policy} has {size:,} bytes: at most {LARGEST_BYTES:,}")
-
     scene = str(config.env.name)
     episodes = episodes or measures_of(scene)[0].episodes
-    said = mappo_eval(f"run={ZOO}", f"env={scene}", f"episodes={episodes}", *opponent(run))
+
+    # what the zoo holds is replaced by what has been measured, and by nothing else
+    with tempfile.TemporaryDirectory(dir=ZOO_FOLDER.parent) as folder:
+        exported = export_checkpoint(choose_checkpoint(run), Path(folder))
+        sizes = {file.policy: file.path.stat().st_size for file in exported}
+        for policy, size in sizes.items():
+            if size > LARGEST_BYTES:
+                raise SystemExit(f"{policy} has {size:,} bytes: at most {LARGEST_BYTES:,}")
+
+        said = mappo_eval(f"run={folder}", f"env={scene}", f"episodes={episodes}", *opponent(run))
+        for file in exported:
+            file.path.replace(ZOO_FOLDER / file.path.name)
+
     return [
         {
             "behavior": file.policy,

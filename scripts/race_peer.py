@@ -33,7 +33,7 @@ from typing import Any
 
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
 from peer_command import add_peer_options, check_peer_options, their_command
-from race_page import EMBEDDED, MATCHES, NAMES, PEER, PLAYER, RACE, WINDOW, write_page
+from race_page import EMBEDDED, MATCHES, NAMES, PEER, PLAYER, RACE, TARGETS, WINDOW, write_page
 from recorded_player import make_player
 from run_script import run_script
 from score_measures import share_won
@@ -43,6 +43,7 @@ from mappo_unity.runs.metrics_csv import read_metrics
 POINTS = 60  # of a curve
 COMPETITIVE = ("SoccerTwos",)
 NUM_MATCHES = 400
+DONE = "trained"  # the file that says so, in a folder whose matches are not all in the table
 
 
 def main() -> None:
@@ -105,6 +106,8 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
     if is_known(scene, seed, who, limit_s / 60):
         return
     folder = folder_of(arguments, scene, seed, who, limit_s / 60)
+    if (folder / DONE).exists():  # only its matches are still to be played
+        return
     shutil.rmtree(folder, ignore_errors=True)  # of a run that was cut off
     folder.mkdir(parents=True)
 
@@ -112,7 +115,8 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
     load, start = os.getloadavg()[0], time.time()
     seconds = run_for(command, folder / "log", limit_s)
     if scene in COMPETITIVE:
-        return  # matches tell who plays well
+        (folder / DONE).touch()  # matches tell who plays well
+        return
 
     points = embedded_curve(folder, start) if who == EMBEDDED else player_curve(folder, start)
     facts = {
@@ -121,7 +125,9 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
         "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
     }
     # whoever is interrupted plays on while it saves
-    for at_s, decisions, value in thin([point for point in points if point[0] <= limit_s], POINTS):
+    points = [point for point in points if point[0] <= limit_s]
+    target = TARGETS.get(scene, math.inf)
+    for at_s, decisions, value in thin(points, POINTS, lambda point: point[2] >= target):
         row = {"scene": scene, "who": who, "seed": seed, "second": round(at_s, 1), "decisions": decisions}
         append(RACE, row | {"return": f"{value:.4g}"} | facts)
     print(scene, who, seed, facts, points[-1:], flush=True)
@@ -178,6 +184,9 @@ def play_matches(arguments: argparse.Namespace, scene: str, seed: int, minutes: 
         append(MATCHES, row)
         print(row, flush=True)
 
+    for who in arguments.who:  # rows that are taken out of the table are trained for anew
+        (folder_of(arguments, scene, seed, who, minutes) / DONE).unlink(missing_ok=True)
+
 
 def decisions_of(folder: Path) -> int:
     """Return how many decisions a run made: by its own metrics, or those that its player was asked for."""
@@ -223,6 +232,9 @@ def run_for(command: list[Any], log: Path, limit_s: float) -> float:
         except subprocess.TimeoutExpired:
             interrupt(process)
             return limit_s
+        except BaseException:  # its session is its own: a Ctrl-C does not reach it
+            interrupt(process)
+            raise
 
     if code:
         raise SystemExit(f"exit code {code}; the end of {log} says why")

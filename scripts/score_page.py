@@ -35,11 +35,12 @@ HEAD = """\
 What `mappo-train env=NAME` reaches with nothing else said (options that were given stand in
 [scores.csv](scores.csv)), beside Unity's own policy in the same scene. Trained and measured by
 `scripts/score_table.py` on a share of two cores (WallJump, Pyramids and Walker, whose presets have
-workers, on both); every value is of 400 episodes or matches (WallJump: 2,000) with the run's best
-checkpoint, sampled as it explores and, after the slash, without sampling. *Ours*: the mean over
-seeds 0 to 2 and, in brackets, each of them. *Kept aside*: seed 3, which nobody looked at while the
-presets were chosen. *Reached after*: decisions and minutes at which the curve of training first
-stood at the target, for the seeds that did.
+workers, on both); every value is of 400 episodes or matches (WallJump: 2,000; against the own
+goalie: 800 matches; decisions to a goal: the half of them that are played as the strikers) with the
+run's best checkpoint, sampled as it explores and, after the slash, without sampling. *Ours*: the
+mean over seeds 0 to 2 and, in brackets, each of them. *Kept aside*: seed 3, which nobody looked at
+while the presets were chosen. *Reached after*: decisions and minutes at which the curve of training
+first stood at the target, for the seeds that did.
 
 Written by the script: change nothing here by hand.
 """

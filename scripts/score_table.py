@@ -26,7 +26,7 @@ from decisions_to import read_last_lesson, with_value
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
 from run_script import check_names, run_script
 from score_measures import MEASURES, Measure, measures_of
-from score_page import CURVES, SCORES, write_page
+from score_page import CURVES, FIXED, SCORES, write_page
 
 from mappo_unity.config.compose import load_config
 from mappo_unity.config.parameters.values import curricula, values_at
@@ -71,8 +71,7 @@ def measure_fixed(arguments: argparse.Namespace, scene: str) -> None:
         players["unity"] = str(arguments.unity.resolve())
 
     for player, run in players.items():
-        if not is_measured(scene, player):
-            score(arguments, scene, player, [f"run={run}", f"env={scene}"], {})
+        score(arguments, scene, player, [f"run={run}", f"env={scene}"], {})
 
 
 def has_policies(folder: Path, scene: str) -> bool:
@@ -90,10 +89,12 @@ def has_policies(folder: Path, scene: str) -> bool:
 
 def measure_seed(arguments: argparse.Namespace, scene: str, seed: int, options: list[str]) -> None:
     """Train a seed to its end or through its minutes, and measure it, unless that has been done."""
-    if is_measured(scene, str(seed)):
+    folder = arguments.out / f"{scene}-{seed}"
+    is_there = any((row["scene"], row["policy"]) == (scene, str(seed)) for row in read_rows(SCORES))
+    # what an interruption left out is measured on, but nothing is trained again for it
+    if is_there and not (missing(arguments, scene, str(seed)) and (folder / "checkpoints").is_dir()):
         return
 
-    folder = arguments.out / f"{scene}-{seed}"
     load = os.getloadavg()[0]
     train(scene, seed, folder, arguments.minutes, options)
 
@@ -147,47 +148,59 @@ def train(scene: str, seed: int, folder: Path, minutes: float, options: list[str
 def score(
     arguments: argparse.Namespace, scene: str, player: str, policy: list[str], facts: dict[str, Any]
 ) -> None:
-    """Evaluate a policy sampled and without sampling; append a row for each measure."""
-    for deterministic in (False, True):
-        said: dict[str | None, dict[str, Any] | None] = {}
-        for measure in measures_of(scene):
-            if measure.opponent not in said:
-                said[measure.opponent] = evaluate(arguments, measure, player, policy, deterministic)
-            figures = said[measure.opponent]
-            if figures is None:
-                continue
+    """Evaluate a policy sampled and without sampling; append a row for each measure that has none."""
+    said: dict[tuple[str | None, bool], dict[str, Any] | None] = {}
+    for measure, deterministic in missing(arguments, scene, player):
+        asked = measure.opponent, deterministic
+        if asked not in said:
+            said[asked] = evaluate(arguments, measure, policy, deterministic)
+        figures = said[asked]
+        if figures is None:
+            continue
 
-            value, stderr = measure.figure(figures)
-            row = {
-                "date": time.strftime("%Y-%m-%d"),
-                "scene": scene,
-                "measure": measure.name,
-                "policy": player,
-                "sampled": not deterministic,
-                "value": f"{value:.4g}",
-                "stderr": f"{stderr:.2g}",
-                "episodes": arguments.episodes or measure.episodes,
-                **{name: facts.get(name, "") for name in ("decisions", "minutes", "options", "load")},
-            }
-            append(SCORES, row)
-            print(row, flush=True)
+        value, stderr = measure.figure(figures)
+        row = {
+            "date": time.strftime("%Y-%m-%d"),
+            "scene": scene,
+            "measure": measure.name,
+            "policy": player,
+            "sampled": not deterministic,
+            "value": f"{value:.4g}",
+            "stderr": f"{stderr:.2g}",
+            "episodes": arguments.episodes or measure.episodes,
+            **{name: facts.get(name, "") for name in ("decisions", "minutes", "options", "load")},
+        }
+        append(SCORES, row)
+        print(row, flush=True)
+
+
+def missing(arguments: argparse.Namespace, scene: str, player: str) -> list[tuple[Measure, bool]]:
+    """Return the measures of a policy without a row in the table, each with whether it is not sampled."""
+    rows = [row for row in read_rows(SCORES) if (row["scene"], row["policy"]) == (scene, player)]
+    standing = {(row["measure"], row["sampled"]) for row in rows}
+    return [
+        (measure, deterministic)
+        for deterministic in (False, True)
+        for measure in measures_of(scene)
+        if is_taken(arguments, measure, player, deterministic)
+        and (measure.name, str(not deterministic)) not in standing
+    ]
+
+
+def is_taken(arguments: argparse.Namespace, measure: Measure, player: str, deterministic: bool) -> bool:
+    """Return whether a measure is taken of a policy: Unity's does not play itself, chance has one way to."""
+    if measure.opponent == "unity":
+        return player not in FIXED and arguments.unity is not None
+    return player != "random" or not (deterministic or measure.opponent == "own")
 
 
 def evaluate(
-    arguments: argparse.Namespace, measure: Measure, player: str, policy: list[str], deterministic: bool
+    arguments: argparse.Namespace, measure: Measure, policy: list[str], deterministic: bool
 ) -> dict[str, Any] | None:
     """Return what mappo-eval says of a policy; None where it cannot be measured."""
-    if player == "unity" and measure.opponent == "unity":
-        return None
-    if player == "random" and (deterministic or measure.opponent in ("unity", "own")):
-        return None
-
     episodes = arguments.episodes or measure.episodes
     lines = [*policy, f"episodes={episodes}", f"deterministic={str(deterministic).lower()}"]
     if measure.opponent == "unity":
-        if arguments.unity is None:
-            print(f"{measure.scene}, {player}: not against Unity's policy, for want of --unity", flush=True)
-            return None
         lines.append(f"opponent={arguments.unity.resolve()}")
     elif measure.opponent == "own":
         lines.append(policy[0].replace("run=", "opponent=", 1))
@@ -197,24 +210,24 @@ def evaluate(
     try:
         return mappo_eval(*lines, timeout_s=EVALUATION_S)
     except subprocess.TimeoutExpired:
-        print(f"{measure.scene}, {player}: no {episodes} episodes in {EVALUATION_S} s", flush=True)
+        print(f"{measure.scene}, {policy[0]}: no {episodes} episodes in {EVALUATION_S} s", flush=True)
     except subprocess.CalledProcessError:
         # what a file lacks (some of Unity's cannot be played without sampling) is one blank, not a run's end
-        print(f"{measure.scene}, {player}: not measured with deterministic={deterministic}", flush=True)
+        print(f"{measure.scene}, {policy[0]}: not measured with {' '.join(lines[1:])}", flush=True)
     return None
 
 
-def is_measured(scene: str, player: str) -> bool:
-    """Return whether every measure of a scene stands in the table for a policy."""
-    return any(row["scene"] == scene and row["policy"] == player for row in read_rows(SCORES))
-
-
 def append_curve(measure: Measure, seed: int, metrics: list[dict[str, int | float]]) -> None:
-    """Append a run's curve, thinned out, in decisions and minutes, from its first values on.
+    """Append a run's curve, thinned out, in decisions and minutes, from its first values on; once.
 
     Of a run with a curriculum it is what it does in its last lesson.
     """
-    for row in thin(with_value(metrics, measure.column), POINTS):
+    curve = measure.scene, measure.column, str(seed)
+    if any((row["scene"], row["column"], row["seed"]) == curve for row in read_rows(CURVES)):
+        return
+
+    points = with_value(metrics, measure.column)
+    for row in thin(points, POINTS, lambda point: measure.is_reached(point[measure.column])):
         point = {
             "scene": measure.scene,
             "column": measure.column,

@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 import decisions_to
 import score_page
 import score_table
+from learn_scene import thin
 from score_measures import MEASURES, Measure, mean_return
 
 from mappo_unity.config.compose import compose_config
@@ -90,9 +91,72 @@ def test_own_matches_are_played_by_one_policy_on_both_sides(monkeypatch: pytest.
     own = next(measure for measure in MEASURES if measure.opponent == "own")
 
     arguments = argparse.Namespace(episodes=None, unity=None)
-    assert score_table.evaluate(arguments, own, "0", ["run=some/run"], False) == {}
+    assert score_table.evaluate(arguments, own, ["run=some/run"], False) == {}
     assert {"run=some/run", "opponent=some/run"} <= set(asked)
-    assert score_table.evaluate(arguments, own, "random", ["run=random"], False) is None
+    assert score_table.is_taken(arguments, own, "0", False)
+    assert not score_table.is_taken(arguments, own, "random", False)
+
+
+def test_what_an_interruption_left_out_is_measured_by_the_next_call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, ...]] = []
+
+    def evaluate(*lines: str, timeout_s: float) -> dict[str, Any]:
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        asked.append(lines)
+        return {"won_of_decided": 0.9, "won_of_decided_low95": 0.8, "won_of_decided_high95": 1.0}
+
+    monkeypatch.setattr(score_table, "SCORES", tmp_path / "scores.csv")
+    monkeypatch.setattr(score_table, "mappo_eval", evaluate)
+    arguments = argparse.Namespace(episodes=None, unity=tmp_path)
+    call = (arguments, "SoccerTwos", "0", ["run=some/run"], {})
+
+    with pytest.raises(KeyboardInterrupt):
+        score_table.score(*call)
+    random, unity = "opponent=random", f"opponent={tmp_path}"
+    assert [(lines[2], lines[3]) for lines in asked] == [
+        ("deterministic=false", random),
+        ("deterministic=false", unity),
+    ]
+
+    asked.append(())  # past the interruption
+    score_table.score(*call)
+    assert [(lines[2], lines[3]) for lines in asked[3:]] == [
+        ("deterministic=true", random),
+        ("deterministic=true", unity),
+    ]
+    assert not score_table.missing(arguments, "SoccerTwos", "0")
+
+    # for what was not asked before, a run that is gone is not trained again
+    (tmp_path / "scores.csv").write_text(
+        "scene,measure,policy,sampled\nSoccerTwos,won against random,0,True\n"
+    )
+    monkeypatch.setattr(score_table, "train", lambda *given: pytest.fail("it trains again"))
+    score_table.measure_seed(
+        argparse.Namespace(episodes=None, unity=tmp_path, out=tmp_path), "SoccerTwos", 0, []
+    )
+
+
+def test_a_thinned_curve_keeps_its_last_point_and_the_first_one_at_the_target() -> None:
+    points = list(range(100))
+    assert thin(points, 10) == [*range(0, 100, 10), 99]
+    assert thin(points, 10, lambda point: point in (43, 47)) == [
+        0,
+        10,
+        20,
+        30,
+        40,
+        43,
+        50,
+        60,
+        70,
+        80,
+        90,
+        99,
+    ]
+    assert thin([], 10, bool) == []
 
 
 def note_options(folder: Path, *options: str) -> None:
