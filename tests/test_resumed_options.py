@@ -8,20 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from tensordict import TensorDict
 from test_self_play import matrix_game
 from test_train import BATCH, TINY, options, rows
 
+from mappo_unity import keys
 from mappo_unity.cli import train_main
-from mappo_unity.config.schema import (
-    Backend,
-    CollectConfig,
-    CuriosityConfig,
-    EnvConfig,
-    Optimizer,
-    PPOConfig,
-    RatioKind,
-    RewardsConfig,
-)
+from mappo_unity.config.schema import Backend, CuriosityConfig, EnvConfig, Optimizer, PPOConfig, RewardsConfig
+from mappo_unity.learning.carried import CarriedRounds
 from mappo_unity.policies.onnx_policy import OnnxPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import NewFolder, create_folder, discard_folder
@@ -62,17 +57,21 @@ def test_a_run_that_goes_back_keeps_its_new_checkpoints(tmp_path: Path, capsys: 
     assert names(tmp_path) == last and not (best.parent / "abandoned_2").exists()
 
 
-def test_decisions_that_are_pending_do_not_outlive_another_ratio(tmp_path: Path) -> None:
-    probe = EnvConfig("custom", Backend.custom, factory="probes:make", params={"probe": "Staggered"})
-    cfg = options(8, env=probe, collect=CollectConfig(rounds=7), export_onnx=False)
-    train(cfg, tmp_path, after_iteration=stop_after(1))
-    path, _ = checkpoint.newest_good(tmp_path)
-    (saved,) = checkpoint.load(path)["learners"].values()
-    assert saved["carried"] is not None, "its agents ask at their own pace"
+def test_decisions_that_are_pending_do_not_outlive_another_ratio() -> None:
+    zeros, ones = torch.zeros(4, 2, 1), torch.ones(4, 2, 1, dtype=torch.bool)
+    flags = dict.fromkeys((keys.ACTING, keys.DEPARTED), ones)
+    ends = dict.fromkeys((keys.TERMINATED, keys.TRUNCATED), ~ones)
+    rewards = dict.fromkeys((keys.REWARD, keys.GROUP_REWARD), zeros)
+    following = TensorDict({**rewards, **ends}, (4, 2))
+    batch = TensorDict({keys.LOG_PROB: zeros, keys.LOG_PROBS: zeros, **flags, "next": following}, (4, 2))
 
-    other = replace(cfg, ppo=replace(cfg.ppo, ratio=RatioKind.component))
-    outcome = train(other, tmp_path, path)
-    assert outcome.agent_steps >= cfg.max_steps
+    joint = CarriedRounds([keys.LOG_PROB])
+    joint.rounds = joint.join(batch)[:1]  # pending
+    assert len(joint.join(batch)) == 5
+
+    component = CarriedRounds([keys.LOG_PROB, keys.LOG_PROBS])
+    component.rounds = joint.rounds
+    assert len(component.join(batch)) == 4
 
 
 def test_the_best_checkpoint_keeps_its_opponents(tmp_path: Path) -> None:
