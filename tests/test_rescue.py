@@ -1,6 +1,7 @@
 """Whatever ends a run, its last complete iteration is saved first, and a line says where."""
 
 import os
+import sys
 
 import pytest
 import torch
@@ -202,12 +203,11 @@ def record():
     return {path.name: path.read_bytes() for path in folder().iterdir() if path.is_file()}
 
 
-@pytest.mark.parametrize("options", [[], ["max_steps=700"], ["max_steps=1000", "stop_at_return=-1000"]])
+@pytest.mark.parametrize("options", [[], ["max_steps=300"], ["max_steps=1000", "stop_at_return=-1000"]])
 def test_a_continuation_that_trains_nothing_changes_nothing_and_says_so(options, capfd):
     assert train_main([*BASIC, "max_steps=512", "log.return_window=1"]) == 0
     before = record()
-    reached = options and options[0] != "max_steps=1000"
-    assert train_main(["resume=run", *(options if not reached else ["max_steps=300"])]) == 0
+    assert train_main(["resume=run", *options]) == 0
     assert "nothing to train, and nothing was changed: the run in run is over" in capfd.readouterr().out
     assert record() == before
 
@@ -281,4 +281,6 @@ def test_sizes_and_limits_of_memory(monkeypatch):
 
 def test_free_memory_is_more_than_nothing():
     free = memory.free_memory()
+    if sys.platform == "linux":
+        assert free is not None
     assert free is None or free > 2**20

@@ -477,9 +477,14 @@ def test_a_killed_search_leaves_nothing_and_goes_on(optuna: Any, tmp_path: Path)
     deadline = time.monotonic() + 120
     while len(list(tmp_path.rglob("metrics.csv"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.05)
+    assert len(list(tmp_path.rglob("metrics.csv"))) == 2, "two trials did not begin within two minutes"
     process.kill()
     process.wait()
 
+    with pytest.raises(ProcessLookupError):  # its workers are of its session, and end when their pipe does
+        for _ in range(200):
+            os.killpg(process.pid, 0)
+            time.sleep(0.1)
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count(" complete ") >= 2 and "best: mappo-train env=Basic" in done.stdout
