@@ -410,3 +410,14 @@ def test_a_sampler_of_no_kind_is_refused() -> None:
 def test_a_sweep_takes_them() -> None:
     lines = ["env=3DBall", "parameters=3DBall_randomize", "env.params.mass={sampler: gaussian},3"]
     assert [c.env.params["mass"] for c in plan_jobs(lines).configs] == [{"sampler": "gaussian"}, 3]
+
+
+def test_a_sampler_draws_other_numbers_than_the_scene_of_its_seed() -> None:
+    parameters = Parameters("Probe", KNOWN, seed=5)
+    parameters.set("x", Sampler("uniform", (0.0, 1.0)))
+    own = parameters.draw("x", 4).tolist()
+    assert own != np.random.default_rng(5).random(4).tolist()
+
+    again = Parameters("Probe", KNOWN, seed=5)
+    again.set("x", Sampler("uniform", (0.0, 1.0)))
+    assert again.draw("x", 4).tolist() == own

@@ -32,10 +32,12 @@ class Target(Scene):
         super().__init__(**options)
         self.position = np.zeros((self.num_areas, 2))  # x, z
         self.target = np.zeros((self.num_areas, 2))
+        self.radius = np.zeros(self.num_areas)
 
     def begin_episode(self, slots: np.ndarray) -> None:
         """Put the point and its target anywhere."""
         self.position[slots], self.target[slots] = self.rng.uniform(-1, 1, (2, len(slots), 2))
+        self.radius[slots] = self.parameters.draw("radius", len(slots))  # for each area its own
 
     def observe(self, behavior: int, slots: np.ndarray) -> list[np.ndarray]:
         """Return the way to the target [n, 2], in metres along x and z."""
@@ -47,17 +49,18 @@ class Target(Scene):
         self.position[slots] = np.clip(moved, -1, 1)
 
         gap = np.linalg.norm(self.target[slots] - self.position[slots], axis=1)
-        reached = gap < self.parameters["radius"]
+        reached = gap < self.radius[slots]
         self.add_reward(slots, np.where(reached, REACHED_REWARD, STEP_REWARD))
         self.end_episode(slots[reached])
 
     def scene_state(self) -> dict[str, Any]:
         """Return where everything is."""
-        return {"position": self.position.copy(), "target": self.target.copy()}
+        return {name: getattr(self, name).copy() for name in ("position", "target", "radius")}
 
     def load_scene_state(self, state: dict[str, Any]) -> None:
         """Put everything where it was."""
-        self.position[:], self.target[:] = state["position"], state["target"]
+        for name in ("position", "target", "radius"):
+            getattr(self, name)[:] = state[name]
 
 
 def shapes(scene: Target, area: int) -> list[Shape]:

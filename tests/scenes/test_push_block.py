@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes import make_scene
 from mappo_unity.scenes.contract.check import check_env
 from mappo_unity.scenes.push_block.scene import AGENT, BLOCK, PushBlock
+from mappo_unity.scenes.push_block.spawn import draw_spots
 
 NAME = "PushBlock?team=0"
 NONE, FORWARD, BACKWARD, RIGHT_TURN, LEFT_TURN, LEFT, RIGHT = range(7)
@@ -270,3 +272,12 @@ def test_gravity_acts_at_once() -> None:
     env.boxes.height[:, AGENT], env.boxes.fall[:] = 1.0, 0.0
     env.simulate()
     assert env.boxes.fall[0, AGENT] == pytest.approx(-5.0 * 0.02 * 0.92)
+
+
+def test_a_block_that_leaves_no_spot_is_told() -> None:
+    middle, yaw = np.zeros((1, 1, 2)), np.zeros((1, 1))
+    there = np.ones((1, 1), bool)
+    with pytest.raises(ConfigError, match="is env.params.block_scale too large"):
+        draw_spots(np.random.default_rng(0), 0.5, FACE, middle, yaw, np.full((1, 1, 2), 20.0), there)
+    spot = draw_spots(np.random.default_rng(0), 0.5, FACE, middle, yaw, np.ones((1, 1, 2)), there)
+    assert np.abs(spot).max() > 1

@@ -38,7 +38,9 @@ class Parameters(Mapping[str, float]):
         """
         self._values[name] = self.check(name, value)
         if isinstance(value, Sampler):
-            self._rngs[name] = np.random.default_rng(value.seed_within(self._seed))
+            # a stream of its own: the scene draws from the seed's, and one begins with the seed itself
+            seed = np.random.SeedSequence(value.seed_within(self._seed), spawn_key=(1,))
+            self._rngs[name] = np.random.default_rng(seed)
 
     def check(self, name: str, value: Any) -> Value:
         """Return the value as it is set; raise ConfigError for an unknown name and a value out of range."""

@@ -37,7 +37,7 @@ GRID = Sensor(
 
 
 class GridFoodCollector(Scene):
-    """Run GridFoodCollector; parameters `agent_scale` and `laser_length` (no effect: only seen)."""
+    """Run GridFoodCollector; parameters `agent_scale` and `laser_length` (accepted, no effect)."""
 
     NAME = "GridFoodCollector"
     DEFAULT_NUM_AREAS = 4

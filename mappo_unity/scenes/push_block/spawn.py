@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.push_block.contacts import as_complex, plan_extents, turns_of
 
 RANGE = 6.25  # m: x and z of a spot, half the floor's half-width
 SPAWN_Y = 1.0
 QUERY_HALF_Y = 0.01
 TRIES = 16  # drawn at once
+MOST_ROUNDS = 1000  # of them; Unity would draw for ever
 
 
 def draw_spots(
@@ -29,11 +31,16 @@ def draw_spots(
 
     `query`: half the width of the box, m; `lowest`: least z that it may reach; `place`, `half` [n, B, 2],
     `yaw`, `there` [n, B]: bodies, and which are in the way.
+
+    Raises:
+        ConfigError: none is found, since a body leaves no room.
     """
     spot = np.zeros((len(place), 2))
     todo = np.arange(len(place))
 
-    while todo.size:
+    for _ in range(MOST_ROUNDS):
+        if not todo.size:
+            return spot
         drawn = rng.uniform(-RANGE, RANGE, (len(todo), TRIES, 2))
         hit = _overlaps(drawn, query, place[todo], yaw[todo], half[todo]) & there[todo][:, None]
         free = ~hit.any(axis=2) & (drawn[:, :, 1] - query >= lowest)
@@ -41,7 +48,10 @@ def draw_spots(
         spot[todo[found]] = drawn[found, free[found].argmax(axis=1)]
         todo = todo[~found]
 
-    return spot
+    raise ConfigError(
+        f"a block leaves no spot free in {MOST_ROUNDS * TRIES:,} draws: is env.params.block_scale too large? "
+        "Unity's range is 0.5 to 4"
+    )
 
 
 def at_query_height(height: np.ndarray, half_y: np.ndarray) -> np.ndarray:
