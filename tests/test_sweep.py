@@ -204,6 +204,36 @@ def test_a_long_check_is_announced_and_finds_each_jobs_own_options() -> None:
         plan_jobs(["seed=0,1,-1", "env.num_areas=3"])
 
 
+@pytest.mark.parametrize(
+    ("lines", "seen"),
+    [
+        (["env=WallJump", "parameters=WallJump_curriculum", "seed=0,1"], [(0, False, True)] * 2),
+        (["env=Walker", "model.memory=lstm", "seed=0,1"], [(1, True, False)] * 2),
+        (["env=DungeonEscape", "model.critic=central,poca"], [(0, False, True), (0, False, False)]),
+        (["env=Pyramids", "env.num_areas=64,65"], [(2, True, True), (1, True, True)]),
+    ],
+)
+def test_a_presets_options_give_way_in_each_job(lines: list[str], seen: list[tuple[int, bool, bool]]) -> None:
+    configs = plan_jobs(lines).configs
+    assert [(c.collect.workers, c.collect.overlap, c.model.mirror.use) for c in configs] == seen
+
+    assert train_main(["-m", *lines, "hydra.sweep.dir=swept"]) == 0
+    trained = [load_config(Path("swept") / str(number) / "config.yaml") for number in range(len(seen))]
+    assert [(c.collect.workers, c.collect.overlap, c.model.mirror.use) for c in trained] == seen
+
+
+def test_a_sampler_of_the_command_line_is_whole_in_each_job() -> None:
+    lines = [
+        "env=3DBall",
+        "parameters=3DBall_randomize",
+        "env.params.mass={sampler: uniform, max: 5}",
+        "seed=0,1",
+    ]
+    assert train_main(["-m", *lines, "hydra.sweep.dir=swept"]) == 0
+    masses = [load_config(Path(f"swept/{number}/config.yaml")).env.params["mass"] for number in (0, 1)]
+    assert masses == [{"sampler": "uniform", "max": 5}] * 2
+
+
 def test_presets_are_chosen_by_their_names() -> None:
     jobs = plan_jobs(["recipe=glob(m*)"]).jobs
     assert jobs == [["recipe=mappo_paper"], ["recipe=mlagents"]]

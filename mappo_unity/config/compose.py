@@ -70,6 +70,13 @@ def compose_config(lines: list[str], base: Path | None = None, file: Path | None
     `base` is the config.yaml of a run that is resumed; without it the presets are the base, and the options
     of `file` go on top of them. Raises ConfigError.
     """
+    tree = compose_tree(lines, base, file)
+    settle(tree, lines, is_resumed=base is not None)
+    return Composed(to_config(tree), tree)
+
+
+def compose_tree(lines: list[str], base: Path | None = None, file: Path | None = None) -> DictConfig:
+    """Return the tree of `compose_config` as Hydra composes it, before `settle`. Raises ConfigError."""
     # our checks come before Hydra's: they name the rule and the choices
     check_overrides(lines, Config, group_choices())
 
@@ -78,16 +85,25 @@ def compose_config(lines: list[str], base: Path | None = None, file: Path | None
 
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-            tree = compose(name, lines, return_hydra_config=True)
-            _keep_parameters_whole(tree, lines)
-            if base is None:
-                given = given_options(lines)
-                let_workers_give_way(tree, given)
-                let_mirror_give_way(tree, given)
+            return compose(name, lines, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error)) from error
 
-    return Composed(to_config(tree), tree)
+
+def settle(tree: DictConfig, lines: list[str], is_resumed: bool = False) -> None:
+    """Do in a composed tree what Hydra does not: let options of presets give way to those of the lines.
+
+    The options of a run that is resumed have settled when it began. Raises ConfigError.
+    """
+    lines = [add_plus_prefix(line) for line in lines]
+    try:
+        _keep_parameters_whole(tree, lines)
+        if not is_resumed:
+            given = given_options(lines)
+            let_workers_give_way(tree, given)
+            let_mirror_give_way(tree, given)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        raise ConfigError(_explain(error)) from error
 
 
 def register_root(lines: list[str], base: Path | None = None, file: Path | None = None) -> str:

@@ -13,7 +13,14 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mappo_unity.config.behavior_lines import all_to_hydra_syntax
-from mappo_unity.config.compose import Composed, check_effect, compose_config, to_config
+from mappo_unity.config.compose import (
+    Composed,
+    check_effect,
+    compose_config,
+    compose_tree,
+    settle,
+    to_config,
+)
 from mappo_unity.config.overrides import check_overrides, last_value, parse, range_length
 from mappo_unity.config.presets import group_choices
 from mappo_unity.config.schema import Config
@@ -51,7 +58,8 @@ def plan_jobs(
 
     # the sizes come first: a grid that is too large is refused before its jobs are listed
     counts = _count_values(task)
-    first = _compose_job(_first_job(task), hydra, file)
+    job = _first_job(task)
+    first = _named(lambda: compose_config([*job, *hydra], file=file), job)
     _check_size(counts, first.config.max_jobs, say)
     jobs = [list(job) for job in BasicSweeper.split_arguments(parse(task), None)[0]]
 
@@ -152,11 +160,8 @@ def _configs(jobs: list[list[str]], hydra: list[str], file: Path | None, first: 
 
         # Jobs with the same presets differ in plain values only: those are set in a tree composed before.
         if presets not in trees or is_merged:
-            composed = _compose_job(job, hydra, file)
-            trees[presets] = _options(composed.tree)
-            configs.append(composed.config)
-        else:
-            configs.append(_changed(trees[presets], changed, job))
+            trees[presets] = _options(_compose_job(job, hydra, file))
+        configs.append(_changed(trees[presets], changed, job))
 
     return configs
 
@@ -183,11 +188,16 @@ def _changed(tree: DictConfig, overrides: list[Override], job: list[str]) -> Con
         # presets are in the tree already
         if override.key_or_group not in group_choices():
             OmegaConf.update(tree, override.key_or_group, override.value(), merge=True, force_add=True)
-    return _named(lambda: to_config(tree), job)
+
+    def settled() -> Config:
+        settle(tree, job)
+        return to_config(tree)
+
+    return _named(settled, job)
 
 
-def _compose_job(job: list[str], hydra: list[str], file: Path | None) -> Composed:
-    return _named(lambda: compose_config([*job, *hydra], file=file), job)
+def _compose_job(job: list[str], hydra: list[str], file: Path | None) -> DictConfig:
+    return _named(lambda: compose_tree([*job, *hydra], file=file), job)
 
 
 def _named(make: Callable[[], Any], job: list[str]) -> Any:

@@ -22,7 +22,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from mappo_unity.config.behavior_lines import all_to_hydra_syntax, dotted_options
-from mappo_unity.config.compose import register_root, to_config
+from mappo_unity.config.compose import register_root, settle, to_config
 from mappo_unity.config.overrides import add_plus_prefix, last_value, parse
 from mappo_unity.config.presets import conf_dir
 from mappo_unity.config.schema import Config
@@ -135,6 +135,7 @@ def _run_job(tree: DictConfig) -> float | None:
 
     try:
         with locked(folder):
+            settle(tree, list(hydra.overrides.task))
             config = adopt_file_options(to_config(tree), result.overrides)
             ended_by = _train(config, folder, result)
     except KeyboardInterrupt as error:
