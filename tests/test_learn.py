@@ -9,7 +9,7 @@ import pytest
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from mappo_unity.cli import learn_main
+from mappo_unity.cli import learn, learn_main
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.mlagents.flags import flag_of, parse_flags
 from mappo_unity.config.mlagents.keys import RUN
@@ -521,6 +521,41 @@ def test_a_run_is_not_overwritten_but_resumed_and_replaced(trained, tmp_path, mo
     assert learn_main(["my.yaml", "--run-id=first", "--force", "--seed=6", *SMALL, "max_steps=240"]) == 0
     assert [row["agent_steps"] for row in read_metrics(run / "metrics.csv")] == [240]
     assert os.listdir("results") == ["first"]
+
+
+def test_what_a_resumed_run_keeps_is_told(trained, tmp_path, monkeypatch, capsys):
+    import shutil
+
+    shutil.copytree(trained, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    resume = ["my.yaml", "--run-id=first", "--resume"]
+    for place in ("scene:Basic", "builds/Game"):
+        assert learn_main([*resume, f"--env={place}"]) == 2
+        error = capsys.readouterr().err
+        assert "--env: the run in results/first was trained in the embedded scene 3DBall and goes on" in error
+
+    # more players than the Editor has are of no account where the run is in no Editor
+    Path("my.yaml").write_text(BALL + "env_settings: {num_envs: 4}\n")
+    options = [*SMALL[1:3], "model.hidden=[8]", "max_steps=720"]
+    assert learn_main([*resume, "--seed=7", "seed=8", *options]) == 0
+    assert "--seed, seed=8: without effect, a resumed run keeps its own" in capsys.readouterr().err
+    assert learn_main(["my.yaml", "--run-id=first", "--inference", "env.params.mass=2"]) == 0
+    assert "env.params.mass=2: without effect, --inference plays what" in capsys.readouterr().err
+
+
+def test_a_run_of_the_editor_goes_on_in_a_build(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = Path("results/first")
+    folder.mkdir(parents=True)
+    Path("my.yaml").write_text(BALL)
+
+    for place, moves in (("env.backend=editor", True), ("env.file_name=builds/Old", False)):
+        saved = compose_config(["env=unity", place]).config
+        monkeypatch.setattr("mappo_unity.config.compose.load_config", lambda path, saved=saved: saved)
+        settings = read_settings(parse_flags(["my.yaml", "--run-id=first", "--resume", "--env=builds/Game"]))
+        lines = learn._run_lines(settings, translate(settings).lines, [], folder, resume=True)
+        assert ("env.backend=player" in lines) == moves
+        assert any(line.startswith("env.file_name=") and "builds/Game" in line for line in lines)
 
 
 def test_a_replacement_that_was_killed_at_once_costs_no_run(tmp_path):

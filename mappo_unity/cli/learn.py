@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 _SEEDS = 10_000  # of those that ML-Agents draws where none is given
 _MOST_ROLLED_BACK = 4
 _FIXED = ("env", "recipe", "seed", "env.num_areas")
-"""Options of a run that a resumed one keeps."""
+_KEPT = ("env_settings.seed", "env_settings.num_areas")
+"""Options of a run that a resumed one keeps, and ML-Agents' names of two that have flags."""
 _PLACES = {"hydra.run.dir": "--run-id=NAME", "output_dir": "--results-dir=FOLDER", "resume": "--resume"}
 """Options of ours that say where a run lies, and the flags that do so here."""
 _OF_PLACES = re.compile(r"env\.(backend|port)=")
@@ -74,6 +75,7 @@ def _about_flags(settings: Settings, flags: learn_flags.Flags) -> list[str]:
     run, said = settings.run, []
     if run["checkpoint_settings.inference"]:
         ignored = [learn_flags.flag_of(key) for key in flags.given if not key.startswith("checkpoint_")]
+        ignored += flags.options
         if flags.config is not None:
             ignored.insert(0, flags.config)
         if ignored:
@@ -82,6 +84,12 @@ def _about_flags(settings: Settings, flags: learn_flags.Flags) -> list[str]:
             )
     elif flags.deterministic:
         said.append("--deterministic has no effect without --inference: training samples its actions")
+
+    if _resumes(settings) and not run["checkpoint_settings.inference"]:
+        kept = [learn_flags.flag_of(key) for key in _KEPT if key in flags.given]
+        kept += [line for line in flags.options if _is_kept(line.partition("=")[0].lstrip("+"))]
+        if kept:
+            said.append(f"{', '.join(kept)}: without effect, a resumed run keeps its own")
 
     if _resumes(settings) and run["checkpoint_settings.initialize_from"] is not None:
         where = run.where("checkpoint_settings.initialize_from")
@@ -97,6 +105,11 @@ def _resumes(settings: Settings) -> bool:
     if starts is not None and starts.where == "--initialize-from" and by_file:
         return False
     return bool(settings.run["checkpoint_settings.resume"])
+
+
+def _is_kept(name: str) -> bool:
+    """Return whether a resumed run keeps its own value of an option; what it begins with is no matter."""
+    return name in _FIXED or name.rpartition(".")[2] == "init_from"
 
 
 def _composed(lines: list[str]) -> Config:
@@ -151,17 +164,23 @@ def _run_lines(
     from mappo_unity.runs.results import LOGS
 
     if resume:
-        if settings.run["env_settings.env_path"] is None:  # where it was trained, not the Editor
-            env = load_config(folder / CONFIG).env
-            other = _OF_SCENES if env.backend is Backend.embedded else _OF_PLACES
+        env, path = load_config(folder / CONFIG).env, settings.run["env_settings.env_path"]
+        is_scene = env.backend is Backend.embedded
+        if path is None:  # where it was trained, not the Editor
+            other = _OF_SCENES if is_scene else _OF_PLACES
             translated = [line for line in translated if not other.match(line)]
+        elif scene_of(settings) != (env.name if is_scene else None):
+            trained = f"the embedded scene {env.name}" if is_scene else "a build or in the Editor"
+            where = settings.run.where("env_settings.env_path")
+            raise ConfigError(
+                f"{where}: the run in {folder} was trained in {trained} and goes on there: leave --env out, "
+                f"or start a run with another --run-id and --initialize-from={folder.name}"
+            )
+        elif env.backend is Backend.editor:
+            translated = [*translated, "env.backend=player"]
         options = [*translated, *own]
         names = [line.partition("=")[0] for line in options]
-        kept = [
-            line
-            for name, line in zip(names, options)
-            if name not in _FIXED and name.rpartition(".")[2] != "init_from"
-        ]
+        kept = [line for name, line in zip(names, options) if not _is_kept(name)]
         return [*kept, f"resume={quoted_path(folder)}"]
 
     options = [*translated, *own]

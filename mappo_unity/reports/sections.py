@@ -107,10 +107,10 @@ def findings(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def status(run: Run) -> str:
-    """Return how a run ended: as its sweep notes it, else by its decisions."""
-    if "status" in run.result:
-        return str(run.result["status"])
+    """Return how a run ended: as its sweep notes it, unless it was resumed since; else by its decisions."""
     done, wanted = last(run, "agent_steps"), run.options.get("max_steps", "")
+    if "status" in run.result and not done > float(run.result.get("agent_steps") or math.inf):
+        return str(run.result["status"])
     if not wanted.isdigit():
         return "-"
     # a run that is being trained, was interrupted or has reached its return: its files do not say which

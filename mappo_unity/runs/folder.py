@@ -31,7 +31,7 @@ from mappo_unity.runs.versions import read_versions
 CONFIG, OVERRIDES, VERSIONS = "config.yaml", "overrides.yaml", "versions.json"
 RECORD = (CONFIG, OVERRIDES, VERSIONS)
 FACTORY_FOLDER = "factory_folder"  # in versions.json
-PLAYERS = "players"  # the folder of their logs
+PLAYERS, LOGS = "players", "run_logs"  # folders of their logs, the latter of mappo-learn, as ML-Agents has it
 METRICS, EVENTS = "metrics.csv", "tensorboard"  # logs, the latter a folder
 
 
@@ -278,7 +278,7 @@ def _other_files(folder: Path) -> dict[Path, tuple[int, int]]:
     """Return what a run's folder holds beside its record and the logs of a run without an iteration."""
     has_rows = bool(_line_after_first(folder / METRICS))
     no_work = (*RECORD, LOCK) if has_rows else (*RECORD, LOCK, METRICS)
-    no_folders = (PLAYERS,) if has_rows else (PLAYERS, EVENTS)
+    no_folders = (PLAYERS, LOGS) if has_rows else (PLAYERS, LOGS, EVENTS)
 
     found = (path for path in folder.rglob("*") if path.is_file() and path.name not in no_work)
     return _state_of(path for path in found if path.relative_to(folder).parts[0] not in no_folders)

@@ -20,11 +20,10 @@ from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.checkpoint_file import FOLDER
-from mappo_unity.runs.folder import CONFIG
+from mappo_unity.runs.folder import CONFIG, LOGS
 from mappo_unity.runs.lock import locked
 
 CONFIGURATION = "configuration.yaml"
-LOGS = "run_logs"
 _SUFFIX = ".onnx"
 
 

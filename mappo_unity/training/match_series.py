@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,8 @@ class MatchSeries:
         with torch.random.fork_rng(devices=cuda):
             torch.manual_seed(cfg.seed + agent_steps)
             # a folder of its own: the run's players log under the same names
+            if env.player_logs is not None:
+                env = replace(env, player_logs=str(Path(env.player_logs) / "matches"))
             make_env = make_env_function(env, self._folder / PLAYERS / "matches")
             seed = (cfg.seed + agent_steps) % 2**31
 

@@ -75,9 +75,11 @@ def _unity(run: Section, path: str | None, where: str, warnings: list[str]) -> O
 
     if path is None:
         out["env.backend"] = ("editor", where)
-        if run["env_settings.num_envs"] > 1:
+        # a run that goes on, or is played, is where it was trained: maybe not in the Editor
+        is_new = not (run["checkpoint_settings.resume"] or run["checkpoint_settings.inference"])
+        if is_new and run["env_settings.num_envs"] > 1:
             raise ConfigError(f"{run.where('env_settings.num_envs')}: more than one needs --env=PATH")
-        if "engine_settings.no_graphics" in run.given and run["engine_settings.no_graphics"]:
+        if is_new and "engine_settings.no_graphics" in run.given and run["engine_settings.no_graphics"]:
             warnings.append(f"{run.where('engine_settings.no_graphics')} has no effect in the Editor")
     else:
         out["env.file_name"] = (path, where)

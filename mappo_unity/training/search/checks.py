@@ -107,7 +107,7 @@ def check_search(options: SearchConfig, lines: list[str], file: Path | None) -> 
     if options.goal is not None:
         if "stop_at_return" in given:
             raise ConfigError(f"goal={options.goal:g} sets stop_at_return: give one of them")
-        lines = [*lines, f"stop_at_return={options.goal:g}"]
+        lines = [*lines, f"stop_at_return={options.goal:.15g}"]
 
     config = _check_corners(space, lines, file)
     preset = {key: entry.written(_value(config, key)) for key, entry in space.items()}

@@ -69,7 +69,7 @@ def best_command(rows: list[Row], plan: SearchPlan) -> str | None:
     if not rows or rows[0].status != "complete":
         return None
 
-    goal = [f"stop_at_return={plan.options.goal:g}"] if plan.options.goal is not None else []
+    goal = [f"stop_at_return={plan.options.goal:.15g}"] if plan.options.goal is not None else []
     config = [] if plan.file is None else ["--config", str(plan.file)]
     lines = [line for line in plan.lines if line not in goal]
     return " ".join(["mappo-train", *map(shell_word, [*config, *lines, *rows[0].lines])])
