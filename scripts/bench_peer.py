@@ -197,7 +197,9 @@ def draw(curves: Curves, path: Path) -> None:
     from matplotlib import pyplot
 
     scenes = sorted({scene for scene, _, _ in curves})
-    figure, axes = pyplot.subplots(2, 2, figsize=(9, 6), layout="constrained")
+    rows = -(-len(scenes) // 2)
+    size = 9, 3 * rows
+    figure, axes = pyplot.subplots(rows, 2, figsize=size, layout="constrained", squeeze=False)
     for axis, scene in zip(axes.flat, scenes):
         for trainer, color in zip(TRAINERS, COLORS):
             of_seeds = [dict(points) for (s, t, _), points in curves.items() if (s, t) == (scene, trainer)]
