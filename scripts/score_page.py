@@ -71,8 +71,9 @@ def table(
 
 
 def of(measure: Measure, rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    """Return the rows of a measure."""
-    return [row for row in rows if (row["scene"], row["measure"]) == (measure.scene, measure.name)]
+    """Return the rows of a measure, without those that were tried in vain."""
+    own = measure.scene, measure.name
+    return [row for row in rows if (row["scene"], row["measure"]) == own and row["value"]]
 
 
 def is_tuned_on(row: dict[str, str]) -> bool:

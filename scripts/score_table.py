@@ -96,7 +96,8 @@ def measure_seed(arguments: argparse.Namespace, scene: str, seed: int, options: 
         return
 
     load = os.getloadavg()[0]
-    train(scene, seed, folder, arguments.minutes, options)
+    if not is_there:
+        train(scene, seed, folder, arguments.minutes, options)
 
     metrics = read_metrics(folder / "metrics.csv")
     facts = {
@@ -106,7 +107,8 @@ def measure_seed(arguments: argparse.Namespace, scene: str, seed: int, options: 
         "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
     }
     shown = read_last_lesson(folder)
-    for measure in {measure.column: measure for measure in measures_of(scene)}.values():
+    # of several measures of one curve, the first is what it shows
+    for measure in {measure.column: measure for measure in reversed(measures_of(scene))}.values():
         append_curve(measure, seed, shown)
     score(arguments, scene, str(seed), [f"run={folder}", *last_lesson(folder)], facts)
 
@@ -155,18 +157,18 @@ def score(
         if asked not in said:
             said[asked] = evaluate(arguments, measure, policy, deterministic)
         figures = said[asked]
-        if figures is None:
-            continue
-
-        value, stderr = measure.figure(figures)
+        value = stderr = ""  # it was tried in vain, and is not again
+        if figures is not None:
+            number, error = measure.figure(figures)
+            value, stderr = f"{number:.4g}", f"{error:.2g}"
         row = {
             "date": time.strftime("%Y-%m-%d"),
             "scene": scene,
             "measure": measure.name,
             "policy": player,
             "sampled": not deterministic,
-            "value": f"{value:.4g}",
-            "stderr": f"{stderr:.2g}",
+            "value": value,
+            "stderr": stderr,
             "episodes": arguments.episodes or measure.episodes,
             **{name: facts.get(name, "") for name in ("decisions", "minutes", "options", "load")},
         }

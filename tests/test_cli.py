@@ -228,10 +228,11 @@ def test_a_mistake_that_the_training_finds_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("logs", ["players", "run_logs"])
 @pytest.mark.parametrize("named", [False, True])
-def test_players_that_came_up_in_vain_leave_nothing(training: FakeTraining, named: bool) -> None:
+def test_players_that_came_up_in_vain_leave_nothing(training: FakeTraining, named: bool, logs: str) -> None:
     def train(cfg: Config, folder: Path, checkpoint: Path | None = None, *show: object) -> Outcome:
-        log = folder / "players" / "Player-0.log"
+        log = folder / logs / "Player-0.log"
         log.parent.mkdir()
         log.write_text("a player's words")
         raise ConfigError(f"its log: {log}" if named else "matches need two sides")

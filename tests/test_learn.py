@@ -533,12 +533,15 @@ def test_what_a_resumed_run_keeps_is_told(trained, tmp_path, monkeypatch, capsys
         assert learn_main([*resume, f"--env={place}"]) == 2
         error = capsys.readouterr().err
         assert "--env: the run in results/first was trained in the embedded scene 3DBall and goes on" in error
+        assert "there: --env=scene:3DBall, or start a run" in error
 
     # more players than the Editor has are of no account where the run is in no Editor
     Path("my.yaml").write_text(BALL + "env_settings: {num_envs: 4}\n")
     options = [*SMALL[1:3], "model.hidden=[8]", "max_steps=720"]
-    assert learn_main([*resume, "--seed=7", "seed=8", *options]) == 0
-    assert "--seed, seed=8: without effect, a resumed run keeps its own" in capsys.readouterr().err
+    assert learn_main([*resume, "--seed=7", "--num-envs=2", "seed=8", *options]) == 0
+    assert (
+        "--seed, --num-envs, seed=8: without effect, a resumed run keeps its own" in capsys.readouterr().err
+    )
     assert learn_main(["my.yaml", "--run-id=first", "--inference", "env.params.mass=2"]) == 0
     assert "env.params.mass=2: without effect, --inference plays what" in capsys.readouterr().err
 
@@ -564,15 +567,17 @@ def test_a_replacement_that_was_killed_at_once_costs_no_run(tmp_path):
     (run / "checkpoints" / "step_240.pt").write_text("good")
     (run / "config.yaml").write_text("")
 
-    # SIGKILL before the first checkpoint: the old run lies aside, and what was begun in its place
-    run.rename(tmp_path / ".first.replaced")
-    run.mkdir()
-    (run / "config.yaml").write_text("")
+    # SIGKILL before the first checkpoint: the old run lies aside, with or without what was begun in its place
+    for has_begun in (True, False):
+        run.rename(tmp_path / ".first.replaced")
+        if has_begun:
+            run.mkdir()
+            (run / "config.yaml").write_text("")
 
-    with pytest.raises(ConfigError), results.replaced(run, force=True):
-        raise ConfigError("a mistake that shows only now")
-    assert (run / "checkpoints" / "step_240.pt").read_text() == "good"
-    assert os.listdir(tmp_path) == ["first"]
+        with pytest.raises(ConfigError), results.replaced(run, force=True):
+            raise ConfigError("a mistake that shows only now")
+        assert (run / "checkpoints" / "step_240.pt").read_text() == "good"
+        assert os.listdir(tmp_path) == ["first"]
 
 
 def test_a_behavior_of_two_words_has_its_file(tmp_path):
@@ -582,10 +587,10 @@ def test_a_behavior_of_two_words_has_its_file(tmp_path):
         checkpoint.with_name(f"final_{stem}.onnx").write_text(stem)
 
     written = results.publish(tmp_path, checkpoint, ["My Behavior", "Other"], 1.0, 40)
-    assert [path.name for path in written] == ["My_Behavior.onnx", "Other.onnx"]
-    assert (tmp_path / "My_Behavior" / "My_Behavior-40.onnx").read_text() == "My_Behavior"
+    assert [path.name for path in written] == ["My Behavior.onnx", "Other.onnx"]
+    assert (tmp_path / "My Behavior" / "My_Behavior-40.onnx").read_text() == "My_Behavior"
     status = json.loads((tmp_path / "run_logs" / "training_status.json").read_text())
-    assert status["My Behavior"]["final_checkpoint"]["file_path"] == str(tmp_path / "My_Behavior.onnx")
+    assert status["My Behavior"]["final_checkpoint"]["file_path"] == str(tmp_path / "My Behavior.onnx")
 
 
 def test_another_run_begins_with_its_networks(trained, tmp_path, monkeypatch):

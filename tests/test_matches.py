@@ -230,6 +230,33 @@ def test_a_policy_and_its_opponent_draw_numbers_of_their_own(monkeypatch):
     assert own == np.random.default_rng(7).random(4).tolist() != other
 
 
+class LaterAndLeft(SecondLater):
+    """The same, whose later resets go on from where it stands: the match under way then is lost by both."""
+
+    is_used = stale = False
+
+    def reset(self):
+        super().reset()
+        self.stale = self.is_used
+
+    def step(self):
+        self.stale = self.stale and not self.played
+        self.is_used = True
+        super().step()
+
+    def get_steps(self, behavior_name):
+        decision, terminal = super().get_steps(behavior_name)
+        terminal.reward[:] = -1.0 if self.stale else 1.0
+        return decision, terminal
+
+
+def test_what_the_reset_of_a_used_environment_begins_does_not_count_for_a_later_side():
+    scores = play_matches(lambda seed: LaterAndLeft(seed, games=4), Always(0), Always(1), 16, seed=0)
+    assert {side: (score.wins, score.losses) for side, score in scores.items()} == dict.fromkeys(
+        matrix_game.SIDES, (8, 0)
+    )
+
+
 def test_both_sides_begin_at_a_snapshot_where_there_are_some():
     made = []
 

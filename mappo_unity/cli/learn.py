@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mappo_unity.config.mlagents import flags as learn_flags
+from mappo_unity.config.mlagents.environment import resumes, scene_of
 from mappo_unity.errors import ConfigError
 from mappo_unity.signals import interrupts_wait
 
@@ -23,6 +24,8 @@ _MOST_ROLLED_BACK = 4
 _FIXED = ("env", "recipe", "seed", "env.num_areas")
 _KEPT = ("env_settings.seed", "env_settings.num_areas")
 """Options of a run that a resumed one keeps, and ML-Agents' names of two that have flags."""
+_OF_PLAYERS = ("env_settings.num_envs", "env_settings.env_args", "engine_settings.no_graphics")
+"""What is said anew with a build, and else kept as well."""
 _PLACES = {"hydra.run.dir": "--run-id=NAME", "output_dir": "--results-dir=FOLDER", "resume": "--resume"}
 """Options of ours that say where a run lies, and the flags that do so here."""
 _OF_PLACES = re.compile(r"env\.(backend|port)=")
@@ -85,26 +88,17 @@ def _about_flags(settings: Settings, flags: learn_flags.Flags) -> list[str]:
     elif flags.deterministic:
         said.append("--deterministic has no effect without --inference: training samples its actions")
 
-    if _resumes(settings) and not run["checkpoint_settings.inference"]:
-        kept = [learn_flags.flag_of(key) for key in _KEPT if key in flags.given]
+    if resumes(settings.run) and not run["checkpoint_settings.inference"]:
+        fixed = _KEPT if run["env_settings.env_path"] is not None else (*_KEPT, *_OF_PLAYERS)
+        kept = [learn_flags.flag_of(key) for key in fixed if key in flags.given]
         kept += [line for line in flags.options if _is_kept(line.partition("=")[0].lstrip("+"))]
         if kept:
             said.append(f"{', '.join(kept)}: without effect, a resumed run keeps its own")
 
-    if _resumes(settings) and run["checkpoint_settings.initialize_from"] is not None:
+    if resumes(settings.run) and run["checkpoint_settings.initialize_from"] is not None:
         where = run.where("checkpoint_settings.initialize_from")
         said.append(f"{where} has no effect: the run is resumed with its own networks")
     return said
-
-
-def _resumes(settings: Settings) -> bool:
-    """Return whether a run is resumed: --initialize-from beats a file that says both, or resume alone."""
-    given = settings.run.given
-    starts = given.get("checkpoint_settings.initialize_from")
-    by_file = settings.run.where("checkpoint_settings.resume") != "--resume"
-    if starts is not None and starts.where == "--initialize-from" and by_file:
-        return False
-    return bool(settings.run["checkpoint_settings.resume"])
 
 
 def _is_kept(name: str) -> bool:
@@ -137,7 +131,7 @@ def _train(settings: Settings, translation: Translation, options: list[str], fol
     from mappo_unity.runs import results
 
     run = settings.run
-    resume, force = _resumes(settings), run["checkpoint_settings.force"]
+    resume, force = resumes(settings.run), run["checkpoint_settings.force"]
     results.check_place(folder, resume, force)
     own = options[len(translation.lines) :]
     lines = _run_lines(settings, translation.lines, own, folder, resume)
@@ -156,7 +150,6 @@ def _run_lines(
 ) -> list[str]:
     """Return all lines of a run: below the options where it goes and what it begins with."""
     from mappo_unity.config.compose import load_config
-    from mappo_unity.config.mlagents.environment import scene_of
     from mappo_unity.config.overrides import last_value
     from mappo_unity.config.schema import Backend
     from mappo_unity.config.text_lines import quoted_path
@@ -171,10 +164,11 @@ def _run_lines(
             translated = [line for line in translated if not other.match(line)]
         elif scene_of(settings) != (env.name if is_scene else None):
             trained = f"the embedded scene {env.name}" if is_scene else "a build or in the Editor"
+            here = f"--env=scene:{env.name}" if is_scene else "leave it out, or name a build"
             where = settings.run.where("env_settings.env_path")
             raise ConfigError(
-                f"{where}: the run in {folder} was trained in {trained} and goes on there: leave --env out, "
-                f"or start a run with another --run-id and --initialize-from={folder.name}"
+                f"{where}: the run in {folder} was trained in {trained} and goes on there: {here}, or start "
+                f"a run with another --run-id and --initialize-from={folder.name}"
             )
         elif env.backend is Backend.editor:
             translated = [*translated, "env.backend=player"]

@@ -56,7 +56,8 @@ def play(
         silent = 0 if _act(env, policy, checks, running, counts) else silent + 1
 
         names = [only] if only else list(env.behavior_specs)
-        counts.skips = False
+        # in a game of turns a side may be asked later
+        counts.skips = counts.skips and not {*names} <= {name for name, _ in running}
         if names and counts.complete(names):
             return counts.ended
         note_silence(silent, MAX_SILENT_STEPS)
@@ -139,15 +140,16 @@ def _end_episodes(name: str, terminal: Any, running: dict, counts: _Counts) -> N
             continue
 
         # The last reward comes with the end, and belongs to the episode.
-        counted, individual, group, length = episode
+        counted, individual, group, length, group_id = episode
         individual, group = (
             individual + float(terminal.reward[row]),
             group + float(terminal.group_reward[row]),
         )
 
         if counted:
-            cut, group_id = bool(terminal.interrupted[row]), int(terminal.group_id[row])
-            ended = Episode(agent, individual, group, int(length), cut, group_id)
+            cut = bool(terminal.interrupted[row])
+            # that of its decisions: Unity's UnregisterAgent takes it out of its group before it ends
+            ended = Episode(agent, individual, group, int(length), cut, int(group_id))
             counts.ended.setdefault(name, []).append(ended)
 
 
@@ -155,11 +157,12 @@ def _go_on(name: str, decision: Any, running: dict, counts: _Counts) -> None:
     for row, agent in enumerate(decision.agent_id.tolist()):
         episode = running.get((name, agent))
         if episode is None:
-            episode = running[name, agent] = [float(counts.begin(name)), 0.0, 0.0, 0.0]
+            episode = running[name, agent] = [float(counts.begin(name)), 0.0, 0.0, 0.0, 0.0]
 
         episode[1] += float(decision.reward[row])
         episode[2] += float(decision.group_reward[row])
         episode[3] += 1
+        episode[4] = float(decision.group_id[row])
 
 
 def summarize(episodes: list[Episode]) -> dict[str, Any]:

@@ -150,7 +150,7 @@ def count_members(env: BaseEnv, behavior: str) -> int | None:
         groups = env.get_steps(behavior)[0].group_id
         if len(groups):
             # group 0 is none: without teams the match of an agent is its own episode
-            return int(np.bincount(groups).max()) if groups[0] > 0 else None
+            return int(np.bincount(groups)[1:].max()) if groups[0] > 0 else None
         note_silence(steps, MAX_SILENT_STEPS)
         env.step()
     raise silence_error(MAX_SILENT_STEPS)

@@ -77,7 +77,8 @@ def discard_folder(folder: NewFolder, reason: BaseException | None = None) -> No
 
     Logs without a row are no more, nor are players' logs, unless `reason`, which the user is told, names one.
     """
-    named = (folder.path / PLAYERS).is_dir() and str(folder.path / PLAYERS) in str(reason)
+    logs = [folder.path / name for name in (PLAYERS, LOGS)]
+    named = any(path.is_dir() and str(path) in str(reason) for path in logs)
     if named or _other_files(folder.path):
         return
 
@@ -225,7 +226,7 @@ def factory_folder(folder: Path) -> Path | None:
 def _claim(wanted: Path, exact: bool) -> Path:
     if exact:
         wanted.mkdir(exist_ok=True)
-        if any(wanted.iterdir()) and not _clear_unbegun(wanted):
+        if any(wanted.iterdir()) and not clear_unbegun(wanted):
             raise ConfigError(
                 f"the folder {wanted} is not empty, and nothing is overwritten: "
                 f"name another one, or resume the run in it with {shell_argument('resume', wanted)}"
@@ -256,7 +257,7 @@ def _history(path: Path) -> list[Any]:
     return history if isinstance(history, list) else []
 
 
-def _clear_unbegun(folder: Path) -> bool:
+def clear_unbegun(folder: Path) -> bool:
     """Empty a folder if it is that of a run killed before its first iteration was complete; tell whether."""
     is_run = all((folder / name).is_file() for name in RECORD)
     if not is_run or _other_files(folder):

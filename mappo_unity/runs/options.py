@@ -6,6 +6,7 @@ The module of env.factory may lie where the run found it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mappo_unity.config.compose import check_effect, compose_config, load_config
@@ -86,4 +87,5 @@ def config_to_play(run: Path, env: str | None, params: Sequence[str] = ()) -> Co
         config = compose_config(list(params), folder / CONFIG).config
     if config.env.factory is not None:
         look_in(factory_folder(folder), config.env.factory, folder)
-    return config
+    # what its players noted while it trained stays
+    return replace(config, env=replace(config.env, player_logs=None))

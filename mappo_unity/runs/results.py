@@ -20,7 +20,7 @@ from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.checkpoint_file import FOLDER
-from mappo_unity.runs.folder import CONFIG, LOGS
+from mappo_unity.runs.folder import CONFIG, LOGS, clear_unbegun
 from mappo_unity.runs.lock import locked
 
 CONFIGURATION = "configuration.yaml"
@@ -41,7 +41,8 @@ def check_place(folder: Path, resume: bool, force: bool) -> None:
             f"no run to resume in {folder}: {other}leave --resume out to start a run, or "
             "--initialize-from=RUN to begin with another one's networks"
         )
-    if folder.is_dir() and any(folder.iterdir()) and not resume and not force:
+    is_taken = folder.is_dir() and any(folder.iterdir()) and not resume and not force
+    if is_taken and not clear_unbegun(folder):
         raise ConfigError(
             f"{folder} holds a previous run: give another --run-id, --resume to go on with it, or --force to "
             "replace it"
@@ -57,13 +58,15 @@ def replaced(folder: Path, force: bool) -> Iterator[None]:
 
     Raises ConfigError where another process trains in it.
     """
+    old = folder.with_name(f".{folder.name}.replaced")
+    if force and old.is_dir() and not folder.is_dir():
+        old.rename(folder)  # of a replacement that was killed before it had a folder
     if not force or not folder.is_dir():
         yield
         return
 
     with locked(folder):
         pass
-    old = folder.with_name(f".{folder.name}.replaced")
     if old.is_dir() and not _has_trained(folder):
         shutil.rmtree(folder)  # of a replacement that was killed before it had learnt anything
     else:
@@ -110,14 +113,14 @@ def publish(
 
     written, status = [], {}
     for policy in policies:
-        stem = keys.file_stem(policy)  # a behavior may be called "My Behavior"
+        stem = keys.file_stem(policy)  # of "My Behavior" My_Behavior
         found = [checkpoint.with_name(name) for name in (f"final_{stem}{_SUFFIX}", f"final{_SUFFIX}")]
         source = next((path for path in found if path.is_file()), None)
         if source is None:  # no ONNX file could be written, which has been said
             continue
 
-        newest, named = folder / f"{stem}{_SUFFIX}", folder / stem / f"{stem}-{steps}{_SUFFIX}"
-        named.parent.mkdir(exist_ok=True)
+        newest, named = folder / f"{policy}{_SUFFIX}", folder / policy / f"{stem}-{steps}{_SUFFIX}"
+        named.parent.mkdir(parents=True, exist_ok=True)
         for path in (newest, named):
             write_atomically(path, source.read_bytes())
         written.append(newest)

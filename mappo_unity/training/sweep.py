@@ -30,8 +30,16 @@ from mappo_unity.config.text_lines import quoted_path
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.runs.atomic import write_atomically
-from mappo_unity.runs.folder import NewFolder, checkpoint_of_job, create_folder, discard_folder, write_record
+from mappo_unity.runs.folder import (
+    METRICS,
+    NewFolder,
+    checkpoint_of_job,
+    create_folder,
+    discard_folder,
+    write_record,
+)
 from mappo_unity.runs.lock import locked
+from mappo_unity.runs.metrics_csv import STEP, read_metrics
 from mappo_unity.runs.progress import job_of_sweep
 from mappo_unity.scenes.factory import check_factory
 from mappo_unity.signals import Interrupted, interrupts_wait
@@ -143,6 +151,7 @@ def _run_job(tree: DictConfig) -> float | None:
         ended_by = getattr(error, "signal", int(signal.SIGINT))
     except Exception as error:
         folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
+        result.agent_steps = _steps_of(folder)
         result.error = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
         (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
 
@@ -154,6 +163,13 @@ def _run_job(tree: DictConfig) -> float | None:
         hand_to_launcher(ended_by)
         raise Interrupted(ended_by)
     return result.return_mean
+
+
+def _steps_of(folder: Path) -> int | None:
+    """Return the decisions that a job's metrics have come to."""
+    path = folder / METRICS
+    rows = read_metrics(path) if path.is_file() else []
+    return int(rows[-1][STEP]) if rows else None
 
 
 def varied_options(jobs: list[JobResult]) -> list[str]:

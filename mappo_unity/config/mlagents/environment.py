@@ -25,6 +25,15 @@ def scene_of(settings: Settings) -> str | None:
     return path[len(SCENE) :] if path is not None and path.startswith(SCENE) else None
 
 
+def resumes(run: Section) -> bool:
+    """Return whether a run is resumed: --initialize-from beats a file that says both, or resume alone."""
+    starts = run.given.get("checkpoint_settings.initialize_from")
+    by_file = run.where("checkpoint_settings.resume") != "--resume"
+    if starts is not None and starts.where == "--initialize-from" and by_file:
+        return False
+    return bool(run["checkpoint_settings.resume"])
+
+
 def environment_options(run: Section, warnings: list[str]) -> Options:
     """Return the options of env, the device and the seed; adds to `warnings`; raises ConfigError."""
     path = run["env_settings.env_path"]
@@ -76,7 +85,7 @@ def _unity(run: Section, path: str | None, where: str, warnings: list[str]) -> O
     if path is None:
         out["env.backend"] = ("editor", where)
         # a run that goes on, or is played, is where it was trained: maybe not in the Editor
-        is_new = not (run["checkpoint_settings.resume"] or run["checkpoint_settings.inference"])
+        is_new = not (resumes(run) or run["checkpoint_settings.inference"])
         if is_new and run["env_settings.num_envs"] > 1:
             raise ConfigError(f"{run.where('env_settings.num_envs')}: more than one needs --env=PATH")
         if is_new and "engine_settings.no_graphics" in run.given and run["engine_settings.no_graphics"]:
