@@ -34,10 +34,8 @@ GROUP_REWARD = "group_reward"  # float32 [..., A, 1]: reward of the agent's team
 DONE = "done"  # bool [..., A, 1]: terminated or truncated
 TERMINATED = "terminated"  # bool [..., A, 1]: a real end
 TRUNCATED = "truncated"  # bool [..., A, 1]: a time limit ("interrupted" in ML-Agents)
-FINAL = "final"  # of what followed a batch: entries [..., A] of the row after the last
-CUT_OFF = (
-    "cut_off"  # team rows [n, A] in which anybody's episode was cut off (or ended): entries as they were
-)
+FINAL = "final"  # of what followed a batch: entries [..., A] behind its last round, as of an end in it
+CUT_OFF = "cut_off"  # team rows [n, A] with an episode that was cut off (or ended): entries as they were
 CUT_OFF_AT = "cut_off_at"  # int64 [n]: which team rows of the batch these are, from its end: -1 is the last
 VALUE = "state_value"  # float32 [..., A, V]: in the critic's (normalised) space
 ADVANTAGE = "advantage"  # float32 [..., A, 1]

@@ -4,6 +4,7 @@ import errno
 import os
 import pickle
 import random
+import stat
 import zipfile
 
 import numpy as np
@@ -22,10 +23,14 @@ STATE = {
 
 
 def test_what_is_saved_comes_back(tmp_path):
-    save(tmp_path / "x.pt", STATE | {"big": 2**127 + 1, "array": np.eye(2), "flag": np.bool_(True)})
+    save(
+        tmp_path / "x.pt",
+        STATE | {"big": 2**127 + 1, "array": np.eye(2), "one": np.zeros(()), "flag": np.bool_(True)},
+    )
     state = to_arrays(load(tmp_path / "x.pt"))
     assert np.array_equal(state["weights"]["a"], np.arange(1000.0))
     assert state["rng"].dtype == np.uint64 and state["rng"].tolist() == [0, 1, 2, 3, 4]
+    assert state["one"].shape == ()
     assert state["big"] == 2**127 + 1 and state["none"] is None and state["flag"] is True
 
 
@@ -109,6 +114,19 @@ def test_other_formats_are_refused(tmp_path):
     torch.save({"format": 99}, tmp_path / "a.pt")
     with pytest.raises(CheckpointError, match="has format 99, but this version reads format 2"):
         load(tmp_path / "a.pt")
+
+
+def test_a_file_system_that_does_not_sync_folders_is_no_hindrance(tmp_path, monkeypatch):
+    fsync = os.fsync
+
+    def of_files_alone(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        fsync(descriptor)
+
+    monkeypatch.setattr(checkpoint.os, "fsync", of_files_alone)
+    save_in(tmp_path, 100, STATE, keep=3, best=True)
+    assert newest_good(tmp_path)[0].name == "step_000000000100.pt"
 
 
 @pytest.mark.parametrize("call", ["save", "fsync"])

@@ -197,8 +197,9 @@ def test_numbers_of_another_type_are_converted() -> None:
         ),
         (
             {"get_state": lambda self: {"at": (1, 2)}},
-            r"get_state\(\)\['at'\] is tuple, not an array or a plain",
+            r"get_state\(\)\['at'\] is tuple, not an array of numbers or a plain",
         ),
+        ({"get_state": lambda self: {"names": np.array(["a"])}}, r"\['names'\] is ndarray, not an array of"),
         ({"get_state": lambda self: {3: 4}}, "has a key 3 that is no string"),
         ({"get_state": lambda self: 1 / 0}, "its get_state raised ZeroDivisionError"),
     ],

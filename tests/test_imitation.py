@@ -166,6 +166,18 @@ def test_decisions_whose_action_is_not_known_teach_nothing() -> None:
     assert expert.first.nonzero().flatten().tolist() == [0, 28, 47]
 
 
+def test_what_an_expert_did_is_allowed_though_its_mask_forbids_it() -> None:
+    demo = demonstration(ActionSpec(0, (2, 2)))
+    demo.mask = np.zeros((len(demo.discrete), 4), bool)
+    demo.mask[:, [0, 2]] = True
+    demo.discrete[5] = [1, 0]
+    expert = make_expert(demo, ["observation"], "cpu")
+    assert expert.mask is not None
+    assert expert.mask[5].tolist() == [True, True, True, False]
+    taken = expert.mask.gather(1, expert.steps.action + torch.tensor([0, 2]))
+    assert taken.all()
+
+
 # --- played back
 
 

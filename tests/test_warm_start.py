@@ -365,6 +365,16 @@ def test_tensors_of_another_shape_are_skipped_and_said(run: Path, tmp_path: Path
     assert "skipped  value_norm.mean" in out and "copied   actor.net.0.weight" in out
 
 
+def test_what_shapes_do_not_show_is_said(run: Path, tmp_path: Path, capsys: Any) -> None:
+    lines = [*TINY, f"init_from={run}", "model.activation=silu", "ppo.normalize_values=none"]
+    assert train_main([*lines, f"output_dir={tmp_path}"]) == 0
+    out = capsys.readouterr().out
+    assert "  note: model.activation=tanh there and silu here: what is copied computes otherwise\n" in out
+    assert out.count("note: ") == 1
+    assert "  skipped  critic " in out and "its values are normalised, here they are not" in out
+    assert "value_norm" not in out
+
+
 def test_a_run_that_began_warm_resumes_without_its_source(run: Path, tmp_path: Path) -> None:
     source = tmp_path / "source"
     shutil.copytree(run, source)

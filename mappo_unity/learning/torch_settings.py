@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import nn
@@ -23,6 +24,19 @@ def compute_as(cfg: Config, threads: int) -> None:
     """
     torch.set_num_threads(min(threads, os.cpu_count() or 1))
     torch.set_float32_matmul_precision(cfg.matmul_precision.value)
+
+
+@contextmanager
+def exact_products() -> Iterator[None]:
+    """Let torch multiply in float32, as other programs do, whatever a run's `matmul_precision` is."""
+    precision, rnn = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+    torch.set_float32_matmul_precision("highest")
+    torch.backends.cudnn.allow_tf32 = False
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(precision)
+        torch.backends.cudnn.allow_tf32 = rnn
 
 
 def cuda_number(device: str) -> int:

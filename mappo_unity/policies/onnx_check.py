@@ -17,6 +17,7 @@ from mappo_unity import keys
 from mappo_unity.config.packages import ExportError
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT, ActionDistribution
 from mappo_unity.learning.networks.encoders import in_floats
+from mappo_unity.learning.torch_settings import exact_products
 from mappo_unity.policies.onnx_policy import fit_image, open_session
 
 TOLERANCE = 1e-5  # of deterministic actions, and of the log-probability of the branch taken
@@ -44,7 +45,7 @@ def compare(
     # behind a memory stands the actor that it was put into
     encoder = (network.actor if actor.has_memory else network).encoder
     feed = _feed(session, encoder, sensors, sample)
-    with torch.no_grad():
+    with torch.no_grad(), exact_products():
         out = actor[0](TensorDict(sample, [len(next(iter(sample.values())))]))
     params = out.get("params")
     expected = ActionDistribution(params, actor.layout, sample.get(keys.MASK))

@@ -45,7 +45,7 @@ def build_model(
     """Build the graph of an actor.
 
     Args:
-        actor: the network (`models.Actor`); it takes all vector sensors in one, then images, then sets.
+        actor: the network (`actor_critic.Actor`); it takes all vector sensors in one, then images, then sets.
         sensors: shape of every sensor, without the batch.
         name: the behavior's name, which the graph bears.
         metadata: what else the file tells of itself.

@@ -10,6 +10,7 @@ tensors and plain values are ever unpickled.
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import shutil
@@ -161,7 +162,7 @@ def _array_to_tensor(array: np.ndarray) -> Any:
             "data": torch.from_numpy(array.view(f"i{array.itemsize}").copy()),
         }
 
-    return torch.from_numpy(np.ascontiguousarray(array).copy())
+    return torch.from_numpy(array.copy(order="C"))  # np.ascontiguousarray makes one number a row of one
 
 
 def to_arrays(value: Any) -> Any:
@@ -184,5 +185,9 @@ def _sync_folder(folder: Path) -> None:
 
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        # some file systems, shared and network ones, do not do so with folders
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):
+            raise
     finally:
         os.close(descriptor)

@@ -65,4 +65,16 @@ def make_expert(demo: Demonstration, obs_keys: Sequence[str], device: str) -> Ex
     # an episode whose first decision was left out begins with the next one
     episode = np.cumsum(demo.first)[known]
     first = np.diff(episode, prepend=-1) != 0
-    return Expert(steps, tensor(first), None if demo.mask is None else tensor(demo.mask[known]))
+    return Expert(steps, tensor(first), None if demo.mask is None else tensor(_with_taken(demo, known)))
+
+
+def _with_taken(demo: Demonstration, known: np.ndarray) -> np.ndarray:
+    """Return the masks of decisions, which allow what was done: Unity's heuristics need not heed them.
+
+    The likelihood of an action that is forbidden would be 0, and its logarithm teaches nothing.
+    """
+    assert demo.mask is not None
+    mask = demo.mask[known].copy()
+    starts = np.cumsum([0, *demo.spec.action_spec.discrete_branches[:-1]])
+    mask[np.arange(len(known))[:, None], demo.discrete[known] + starts] = True
+    return mask

@@ -6,15 +6,17 @@ Only networks are copied: steps, optimizer, schedules and episodes begin anew.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from mappo_unity.config.option_table import show_value
-from mappo_unity.config.per_behavior import init_source
-from mappo_unity.config.schema import Config, show_mirror
+from mappo_unity.config.per_behavior import behavior_config, init_source
+from mappo_unity.config.schema import Config, DistributionKind, MemoryKind, ModelConfig, show_mirror
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.value_norm import by_stream
+from mappo_unity.policies.policy import model_from_saved
 from mappo_unity.policies.policy_files import Kind, choose_checkpoint
 from mappo_unity.policies.warm_start.actors import copy_network
 from mappo_unity.policies.warm_start.onnx_network import read_network
@@ -46,8 +48,11 @@ def warm_start(
         try:
             if source.kind is Kind.onnx:
                 told, rows = _from_onnx(source.path, learner, layouts[name])
+                notes = []
             else:
-                told, rows = _from_checkpoint(choose_checkpoint(source.path, option), name, learner)
+                path = choose_checkpoint(source.path, option)
+                told, rows, theirs = _from_checkpoint(path, name, learner)
+                notes = _unseen(theirs, behavior_config(cfg, name).model)
         except ConfigError as error:
             raise ConfigError(f"{option}: {error}") from error
 
@@ -60,7 +65,7 @@ def warm_start(
             )
             mistake.details = tuple(table(rows))
             raise mistake
-        lines += [f"{name} begins with {told}:", *table(rows)]
+        lines += [f"{name} begins with {told}:", *table(rows), *notes]
     return lines
 
 
@@ -81,7 +86,23 @@ def show_options(options: Mapping[str, Any]) -> str:
     return " ".join(shown + [f"mirror={mirror}"] * (mirror != "none"))
 
 
-def _from_checkpoint(path: Path, name: str, learner: PolicyLearner) -> tuple[str, list[Row]]:
+def _unseen(there: ModelConfig, here: ModelConfig) -> list[str]:
+    """Return a line about each option that the layers' shapes do not show, and that is another one here."""
+    options = ["activation", "action_distribution"]
+    if here.action_distribution is DistributionKind.tanh_normal:
+        options.append("init_log_std")
+    if here.memory is MemoryKind.traces:
+        options += ["memory_traces", "memory_traced"]
+    pairs = [(option, *(show_value(getattr(model, option)) for model in (there, here))) for option in options]
+    pairs.append(("mirror", *(show_mirror(asdict(model.mirror)) for model in (there, here))))
+    return [
+        f"  note: model.{option}={old} there and {new} here: what is copied computes otherwise"
+        for option, old, new in pairs
+        if old != new
+    ]
+
+
+def _from_checkpoint(path: Path, name: str, learner: PolicyLearner) -> tuple[str, list[Row], ModelConfig]:
     state = checkpoint.load(path)
     known = list(state["learners"])
     if name not in known and len(known) > 1:
@@ -93,13 +114,20 @@ def _from_checkpoint(path: Path, name: str, learner: PolicyLearner) -> tuple[str
     theirs = name if name in known else known[0]
     saved = state["learners"][theirs]
     rows = copy_fitting(learner.actor, "actor", saved["actor"], {})
-    critic = copy_fitting(learner.critic, "critic", saved["critic"], {})
-
-    # the values of a critic are in the scale of the statistics under which it learnt
-    whole = not any(row.reason for row in critic)
-    statistics = by_stream(saved["value_norm"]) if whole else {}
-    norm = copy_fitting(
-        learner.value_norm, "value_norm", statistics, {"": "it is of use to the whole critic only"}
-    )
+    rows += _critic(learner, saved["critic"], by_stream(saved["value_norm"]))
     told = f"{path}" + (f", policy {theirs}" if theirs != name else "")
-    return f"{told} ({int(state['agent_steps']):,} agent steps)", [*rows, *critic, *norm]
+    model = model_from_saved(state["model"][theirs])
+    return f"{told} ({int(state['agent_steps']):,} agent steps)", rows, model
+
+
+def _critic(learner: PolicyLearner, saved: dict[str, Any], statistics: dict[str, Any]) -> list[Row]:
+    """Copy a critic; its values are in the scale of the statistics under which it learnt."""
+    if not learner.value_norm.enabled and float(statistics["debias"]) > 0:
+        return [
+            Row("critic", None, "its values are normalised, here they are not (ppo.normalize_values=none)")
+        ]
+
+    critic = copy_fitting(learner.critic, "critic", saved, {})
+    whole = not any(row.reason for row in critic)
+    reason = {"": "it is of use to the whole critic only"}
+    return [*critic, *copy_fitting(learner.value_norm, "value_norm", statistics if whole else {}, reason)]

@@ -136,12 +136,12 @@ def check_plain(value: Any, where: str) -> None:
         for number, item in enumerate(value):
             check_plain(item, f"{where}[{number}]")
     else:
-        # Exact types, and no arrays of objects: a checkpoint opens without running any class's code.
-        is_array = isinstance(value, (np.ndarray, np.generic)) and value.dtype != object
+        # Exact types, and arrays of numbers: a checkpoint opens without running any class's code.
+        is_array = isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "biuf"
         if not is_array and type(value) not in (int, float, str, bool, type(None)):
             raise EnvironmentDataError(
-                f"{where} is {type(value).__name__}, not an array or a plain value; checkpoints hold dicts, "
-                "lists, NumPy arrays, numbers, texts, True, False and None"
+                f"{where} is {type(value).__name__}, not an array of numbers or a plain value; checkpoints "
+                "hold dicts, lists, NumPy arrays of numbers, numbers, texts, True, False and None"
             )
 
 
