@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -168,8 +169,9 @@ def test_decisions_whose_action_is_not_known_teach_nothing() -> None:
 
 def test_what_an_expert_did_is_allowed_though_its_mask_forbids_it() -> None:
     demo = demonstration(ActionSpec(0, (2, 2)))
-    demo.mask = np.zeros((len(demo.discrete), 4), bool)
-    demo.mask[:, [0, 2]] = True
+    mask = np.zeros((len(demo.discrete), 4), bool)
+    mask[:, [0, 2]] = True
+    demo = replace(demo, mask=mask)
     demo.discrete[5] = [1, 0]
     expert = make_expert(demo, ["observation"], "cpu")
     assert expert.mask is not None

@@ -574,10 +574,33 @@ def test_a_replacement_that_was_killed_at_once_costs_no_run(tmp_path):
             run.mkdir()
             (run / "config.yaml").write_text("")
 
+        results.bring_back(run)
         with pytest.raises(ConfigError), results.replaced(run, force=True):
+            (run / "run_logs").mkdir(parents=True)
+            (run / "run_logs" / "Player-0.log").write_text(f"crashed {has_begun}")
             raise ConfigError("a mistake that shows only now")
+        assert (run / "run_logs" / "Player-0.log").read_text() == f"crashed {has_begun}"
         assert (run / "checkpoints" / "step_240.pt").read_text() == "good"
         assert os.listdir(tmp_path) == ["first"]
+
+
+def test_a_first_start_that_failed_blocks_no_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("my.yaml").write_text(BALL)
+    lines = ["my.yaml", "--run-id=first", "--seed=5", *SMALL]
+
+    def fail(cfg, folder, *more):
+        log = folder / "run_logs" / "Player-0.log"
+        log.parent.mkdir()
+        log.write_text("a player's words")
+        raise ConfigError(f"the player ended; its log: {log}")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mappo_unity.training.trainer.train", fail)
+        assert learn_main(lines) == 2
+    assert Path("results/first/run_logs/Player-0.log").is_file(), "the message names it"
+    assert learn_main(lines) == 0, capsys.readouterr().err
+    assert Path("results/first/3DBall.onnx").is_file()
 
 
 def test_a_behavior_of_two_words_has_its_file(tmp_path):
@@ -588,7 +611,7 @@ def test_a_behavior_of_two_words_has_its_file(tmp_path):
 
     written = results.publish(tmp_path, checkpoint, ["My Behavior", "Other"], 1.0, 40)
     assert [path.name for path in written] == ["My Behavior.onnx", "Other.onnx"]
-    assert (tmp_path / "My Behavior" / "My_Behavior-40.onnx").read_text() == "My_Behavior"
+    assert (tmp_path / "My Behavior" / "My Behavior-40.onnx").read_text() == "My_Behavior"
     status = json.loads((tmp_path / "run_logs" / "training_status.json").read_text())
     assert status["My Behavior"]["final_checkpoint"]["file_path"] == str(tmp_path / "My Behavior.onnx")
 

@@ -231,22 +231,23 @@ def test_a_policy_and_its_opponent_draw_numbers_of_their_own(monkeypatch):
 
 
 class LaterAndLeft(SecondLater):
-    """The same, whose later resets go on from where it stands: the match under way then is lost by both."""
+    """The same, whose later resets go on from where it stands: each side loses the first match after them."""
 
-    is_used = stale = False
+    is_used, since = False, 99
 
     def reset(self):
         super().reset()
-        self.stale = self.is_used
+        self.since = 0 if self.is_used else 99
 
     def step(self):
-        self.stale = self.stale and not self.played
+        self.since += 1
         self.is_used = True
         super().step()
 
     def get_steps(self, behavior_name):
         decision, terminal = super().get_steps(behavior_name)
-        terminal.reward[:] = -1.0 if self.stale else 1.0
+        first = 1 + matrix_game.SIDES.index(behavior_name)  # the step that ends its first match
+        terminal.reward[:] = -1.0 if self.since <= first else 1.0
         return decision, terminal
 
 

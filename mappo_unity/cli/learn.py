@@ -132,6 +132,7 @@ def _train(settings: Settings, translation: Translation, options: list[str], fol
 
     run = settings.run
     resume, force = resumes(settings.run), run["checkpoint_settings.force"]
+    results.bring_back(folder)
     results.check_place(folder, resume, force)
     own = options[len(translation.lines) :]
     lines = _run_lines(settings, translation.lines, own, folder, resume)
@@ -265,7 +266,7 @@ def _play(settings: Settings, folder: Path, deterministic: bool) -> int:
     from mappo_unity.runs.results import check_place
 
     name = settings.run["checkpoint_settings.initialize_from"]
-    if name is not None and not settings.run["checkpoint_settings.resume"]:
+    if name is not None and not resumes(settings.run):
         folder = _run_folder(settings, name)
     check_place(folder, resume=True, force=False)
     return evaluation.run([f"run={quoted_path(folder)}", f"deterministic={str(deterministic).lower()}"])

@@ -150,7 +150,8 @@ def count_members(env: BaseEnv, behavior: str) -> int | None:
         groups = env.get_steps(behavior)[0].group_id
         if len(groups):
             # group 0 is none: without teams the match of an agent is its own episode
-            return int(np.bincount(groups)[1:].max()) if groups[0] > 0 else None
+            sizes = np.bincount(groups)[1:]
+            return int(sizes.max()) if sizes.any() else None
         note_silence(steps, MAX_SILENT_STEPS)
         env.step()
     raise silence_error(MAX_SILENT_STEPS)
@@ -183,6 +184,8 @@ def _last_of_teams(episodes: list[Episode], members: int) -> Iterator[Episode]:
     ends = dict[int, int]()
     for episode in episodes:
         group = episode.group_id
+        if not group:  # an agent beside the teams
+            continue
         last[group], ends[group] = episode, ends.get(group, 0) + 1
         if ends[group] == members:
             ends[group] = 0

@@ -225,12 +225,18 @@ class OnnxFolder:
     def _policy(self, behavior: str) -> OnnxPolicy:
         name = keys.policy_name(behavior)
         if name not in self._policies:
-            path = self.path / file_name(name)
+            path = file_in(self.path, name)
             if not path.is_file():
                 files = sorted(p.name for p in self.path.glob(f"*{SUFFIX}"))
                 raise ConfigError(f"{behavior!r} needs a file {path}; there are {', '.join(files) or 'none'}")
             self._policies[name] = OnnxPolicy(path, self.deterministic, self.seed)
         return self._policies[name]
+
+
+def file_in(folder: Path, policy: str) -> Path:
+    """Return the file of a policy in a folder: under its own name, as ML-Agents writes it, or `file_name`."""
+    own = folder / f"{policy}{SUFFIX}"
+    return own if own.is_file() else folder / file_name(policy)
 
 
 def file_name(policy: str) -> str:

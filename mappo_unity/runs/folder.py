@@ -77,9 +77,8 @@ def discard_folder(folder: NewFolder, reason: BaseException | None = None) -> No
 
     Logs without a row are no more, nor are players' logs, unless `reason`, which the user is told, names one.
     """
-    logs = [folder.path / name for name in (PLAYERS, LOGS)]
-    named = any(path.is_dir() and str(path) in str(reason) for path in logs)
-    if named or _other_files(folder.path):
+    logs = [path for path in (folder.path / PLAYERS, folder.path / LOGS) if path.is_dir()]
+    if any(str(path) in str(reason) for path in logs) or _other_files(folder.path):
         return
 
     shutil.rmtree(folder.path, ignore_errors=True)  # it may be gone already
@@ -226,7 +225,7 @@ def factory_folder(folder: Path) -> Path | None:
 def _claim(wanted: Path, exact: bool) -> Path:
     if exact:
         wanted.mkdir(exist_ok=True)
-        if any(wanted.iterdir()) and not clear_unbegun(wanted):
+        if any(wanted.iterdir()) and not _clear_unbegun(wanted):
             raise ConfigError(
                 f"the folder {wanted} is not empty, and nothing is overwritten: "
                 f"name another one, or resume the run in it with {shell_argument('resume', wanted)}"
@@ -257,10 +256,14 @@ def _history(path: Path) -> list[Any]:
     return history if isinstance(history, list) else []
 
 
-def clear_unbegun(folder: Path) -> bool:
-    """Empty a folder if it is that of a run killed before its first iteration was complete; tell whether."""
-    is_run = all((folder / name).is_file() for name in RECORD)
-    if not is_run or _other_files(folder):
+def is_unbegun(folder: Path) -> bool:
+    """Return whether a folder is that of a run that ended before its first iteration was complete."""
+    return all((folder / name).is_file() for name in RECORD) and not _other_files(folder)
+
+
+def _clear_unbegun(folder: Path) -> bool:
+    """Empty a folder if it `is_unbegun`; tell whether."""
+    if not is_unbegun(folder):
         return False
 
     # Another process may be about to complete it.

@@ -20,7 +20,7 @@ from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.checkpoint_file import FOLDER
-from mappo_unity.runs.folder import CONFIG, LOGS, clear_unbegun
+from mappo_unity.runs.folder import CONFIG, LOGS, is_unbegun
 from mappo_unity.runs.lock import locked
 
 CONFIGURATION = "configuration.yaml"
@@ -42,7 +42,7 @@ def check_place(folder: Path, resume: bool, force: bool) -> None:
             "--initialize-from=RUN to begin with another one's networks"
         )
     is_taken = folder.is_dir() and any(folder.iterdir()) and not resume and not force
-    if is_taken and not clear_unbegun(folder):
+    if is_taken and not is_unbegun(folder):
         raise ConfigError(
             f"{folder} holds a previous run: give another --run-id, --resume to go on with it, or --force to "
             "replace it"
@@ -58,29 +58,45 @@ def replaced(folder: Path, force: bool) -> Iterator[None]:
 
     Raises ConfigError where another process trains in it.
     """
-    old = folder.with_name(f".{folder.name}.replaced")
-    if force and old.is_dir() and not folder.is_dir():
-        old.rename(folder)  # of a replacement that was killed before it had a folder
     if not force or not folder.is_dir():
         yield
         return
 
     with locked(folder):
         pass
-    if old.is_dir() and not _has_trained(folder):
-        shutil.rmtree(folder)  # of a replacement that was killed before it had learnt anything
-    else:
-        shutil.rmtree(old, ignore_errors=True)
-        folder.rename(old)
-
+    old = _aside(folder)
+    shutil.rmtree(old, ignore_errors=True)  # of a replacement that had learnt something when it was killed
+    folder.rename(old)
     try:
         yield
     finally:
         if _has_trained(folder):
             shutil.rmtree(old, ignore_errors=True)
         else:
+            if (folder / LOGS).is_dir():  # a message may name a log that says why nothing was learnt
+                shutil.copytree(folder / LOGS, old / LOGS, dirs_exist_ok=True)
             shutil.rmtree(folder, ignore_errors=True)
             old.rename(folder)
+
+
+def bring_back(folder: Path) -> None:
+    """Bring a run back that `replaced` set aside for one that was killed before it had learnt anything.
+
+    Raises ConfigError where another process trains in its place.
+    """
+    old = _aside(folder)
+    if not old.is_dir() or _has_trained(folder):
+        return
+
+    if folder.is_dir():
+        with locked(folder):
+            pass
+        shutil.rmtree(folder)
+    old.rename(folder)
+
+
+def _aside(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.replaced")
 
 
 def _has_trained(folder: Path) -> bool:
@@ -119,7 +135,8 @@ def publish(
         if source is None:  # no ONNX file could be written, which has been said
             continue
 
-        newest, named = folder / f"{policy}{_SUFFIX}", folder / policy / f"{stem}-{steps}{_SUFFIX}"
+        last = Path(policy).name  # a behavior may be called "Game/Walker"
+        newest, named = folder / f"{policy}{_SUFFIX}", folder / policy / f"{last}-{steps}{_SUFFIX}"
         named.parent.mkdir(parents=True, exist_ok=True)
         for path in (newest, named):
             write_atomically(path, source.read_bytes())

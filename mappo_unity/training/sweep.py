@@ -151,9 +151,9 @@ def _run_job(tree: DictConfig) -> float | None:
         ended_by = getattr(error, "signal", int(signal.SIGINT))
     except Exception as error:
         folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
-        result.agent_steps = _steps_of(folder)
         result.error = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
         (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
+        result.agent_steps = steps_of(folder)
 
     # Whatever became of the job: its result is there before a signal goes on to the sweep.
     result.wall_s = round(result.wall_s or time.monotonic() - start_s, 3)
@@ -165,11 +165,12 @@ def _run_job(tree: DictConfig) -> float | None:
     return result.return_mean
 
 
-def _steps_of(folder: Path) -> int | None:
-    """Return the decisions that a job's metrics have come to."""
-    path = folder / METRICS
-    rows = read_metrics(path) if path.is_file() else []
-    return int(rows[-1][STEP]) if rows else None
+def steps_of(folder: Path) -> int | None:
+    """Return the decisions that the metrics of a job that failed have come to; None: they cannot be read."""
+    try:
+        return int(read_metrics(folder / METRICS)[-1][STEP])
+    except (OSError, ValueError, LookupError):
+        return None
 
 
 def varied_options(jobs: list[JobResult]) -> list[str]:

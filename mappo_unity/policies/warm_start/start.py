@@ -52,7 +52,8 @@ def warm_start(
             else:
                 path = choose_checkpoint(source.path, option)
                 told, rows, theirs = _from_checkpoint(path, name, learner)
-                notes = _unseen(theirs, behavior_config(cfg, name).model)
+                own = behavior_config(cfg, name).model
+                notes = _unseen(theirs, own, learner.actor.layout.continuous > 0)
         except ConfigError as error:
             raise ConfigError(f"{option}: {error}") from error
 
@@ -86,9 +87,12 @@ def show_options(options: Mapping[str, Any]) -> str:
     return " ".join(shown + [f"mirror={mirror}"] * (mirror != "none"))
 
 
-def _unseen(there: ModelConfig, here: ModelConfig) -> list[str]:
+def _unseen(there: ModelConfig, here: ModelConfig, is_continuous: bool) -> list[str]:
     """Return a line about each option that the layers' shapes do not show, and that is another one here."""
-    options = ["activation", "action_distribution"]
+    options = ["activation", "normalize_obs", "layer_norm", "flatten_branches"]
+    options += ["critic_traces", "critic_traced"]
+    if is_continuous:
+        options.append("action_distribution")
     if here.action_distribution is DistributionKind.tanh_normal:
         options.append("init_log_std")
     if here.memory is MemoryKind.traces:

@@ -21,7 +21,7 @@ from mappo_unity.runs.lock import locked
 from mappo_unity.scenes.factory import check_factory
 from mappo_unity.training.child_process import begin_child
 from mappo_unity.training.search.messages import GO, MARKS, PRUNE, Run, Task, TrialResult
-from mappo_unity.training.sweep import RESULT, JobResult
+from mappo_unity.training.sweep import RESULT, JobResult, steps_of
 
 if TYPE_CHECKING:
     from mappo_unity.training.outcome import Outcome
@@ -65,6 +65,7 @@ def run_trial(task: Task, report: Report) -> TrialResult:
             run.folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
             job.error = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
             (run.folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
+            job.agent_steps = steps_of(run.folder)
             outcome = None
 
         _write(run, job)

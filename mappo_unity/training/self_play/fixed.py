@@ -13,8 +13,9 @@ from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT
 from mappo_unity.learning.networks.opponents import Player, RandomActor
 from mappo_unity.policies.layouts import check_layout
+from mappo_unity.policies.onnx_policy import file_in
 from mappo_unity.policies.policy import actor_of
-from mappo_unity.policies.policy_files import SUFFIX, Kind, choose_checkpoint, locate
+from mappo_unity.policies.policy_files import Kind, choose_checkpoint, locate
 from mappo_unity.policies.warm_start.actors import actor_from_onnx
 from mappo_unity.runs import checkpoint
 
@@ -60,7 +61,7 @@ def _file_of(path: Path, name: str, count: int) -> Path:
             f"{OPTION}: {path} holds one policy, and the environment has {count}: name a folder with "
             "NAME.onnx for each"
         )
-    own = path / f"{keys.file_stem(name)}{SUFFIX}"
+    own = file_in(path, name)
     if not own.is_file():
         raise ConfigError(f"{OPTION}: the folder {path} has no {own.name}")
     return own
