@@ -86,7 +86,9 @@ def examine_packages(report: Report) -> None:
         try:
             report.good(f"{name} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:
-            report.fail(f"{name} is not installed", f"pip install {name}")
+            report.fail(
+                f"{name} is not installed", "pip install mappo-unity, which brings what goes together"
+            )
 
     from google.protobuf.internal import api_implementation
 

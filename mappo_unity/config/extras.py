@@ -33,10 +33,15 @@ def install_command(extra: str) -> str:
 
     if (ROOT / "pyproject.toml").is_file():  # a clone, in an environment of the user's
         place = "." if is_here else str(ROOT)
-        return f"pip install --editable {shlex.quote(f'{place}[{extra}]')}"
+        return f"pip install --editable {_quoted(f'{place}[{extra}]')}"
 
     # by the packages' names: the package itself may have come from a folder that is gone
-    return "pip install " + " ".join(shlex.quote(package) for package in _packages(extra))
+    return "pip install " + " ".join(_quoted(package) for package in _packages(extra))
+
+
+def _quoted(word: str) -> str:
+    """Return a word as a shell takes it; cmd.exe knows double quotes only, and reads > as elsewhere."""
+    return shlex.quote(word) if os.name == "posix" else f'"{word}"'
 
 
 def _packages(extra: str) -> list[str]:
