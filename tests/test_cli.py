@@ -20,7 +20,7 @@ import yaml
 from fake_training import Outcome
 
 from mappo_unity import __version__
-from mappo_unity.cli import eval_main, train_main
+from mappo_unity.cli import eval_main, report_main, train_main
 from mappo_unity.config.option_table import option_table
 from mappo_unity.config.presets import all_groups, describe_choices
 from mappo_unity.config.schema import Config, EvalConfig
@@ -226,6 +226,28 @@ def test_a_mistake_that_the_training_finds_leaves_nothing(
     assert train_main(["device=cuda"]) == 2
     assert "device=cuda: there is none" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("lines", "word"),
+    [
+        (["hydra.run.dir=null"], "hydra.run.dir=null: "),
+        (["hydra.run.dir=runs/${env.nme}"], "hydra.run.dir: "),
+        (["-m", "seed=0,1", "hydra.sweep.dir=x/${env.nme}"], "hydra.sweep.dir: "),
+        ([f"output_dir={'a' * 300}"], "File name too long"),
+        ([f"ppo.lr=1{'0' * 400}"], "does not fit: ppo.lr must be a number"),
+    ],
+)
+def test_places_and_numbers_that_cannot_be(
+    training: FakeTraining, lines: list[str], word: str, capsys: Any
+) -> None:
+    assert train_main(lines) == 2
+    assert word in capsys.readouterr().err and not list(Path().iterdir())
+
+
+def test_a_pattern_that_the_shell_left_is_told(capsys: Any) -> None:
+    assert report_main(["???"]) == 2
+    assert "runs[0] is not given" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("logs", ["players", "run_logs"])

@@ -584,6 +584,16 @@ def test_a_replacement_that_was_killed_at_once_costs_no_run(tmp_path):
         assert os.listdir(tmp_path) == ["first"]
 
 
+@pytest.mark.parametrize(
+    "text", ["behaviors: \x00", "checkpoint_settings: {run_id: 2026-02-30}", "behaviors: &a {x: *a}"]
+)
+def test_a_file_that_yaml_cannot_make_anything_of_is_told(tmp_path, monkeypatch, capsys, text):
+    monkeypatch.chdir(tmp_path)
+    Path("my.yaml").write_text(text)
+    assert learn_main(["my.yaml"]) == 2
+    assert "my.yaml" in capsys.readouterr().err and os.listdir() == ["my.yaml"]
+
+
 def test_a_first_start_that_failed_blocks_no_name(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("my.yaml").write_text(BALL)

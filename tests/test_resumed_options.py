@@ -57,6 +57,16 @@ def test_a_run_that_goes_back_keeps_its_new_checkpoints(tmp_path: Path, capsys: 
     assert names(tmp_path) == last and not (best.parent / "abandoned_2").exists()
 
 
+def test_an_interruption_does_not_move_the_rhythm_of_checkpoints(tmp_path: Path) -> None:
+    cfg = options(9, keep_checkpoints=20, checkpoint_interval=3 * BATCH, export_onnx=False)
+    train(cfg, tmp_path / "whole")
+    train(cfg, tmp_path / "parts", after_iteration=stop_after(4))
+    path, _ = checkpoint.newest_good(tmp_path / "parts")
+    train(cfg, tmp_path / "parts", path)
+    assert names(tmp_path / "whole") == [f"step_{n * BATCH:012d}.pt" for n in (1, 3, 6, 9)]
+    assert names(tmp_path / "parts") == [f"step_{n * BATCH:012d}.pt" for n in (1, 3, 4, 6, 9)]
+
+
 def test_decisions_that_are_pending_do_not_outlive_another_ratio() -> None:
     zeros, ones = torch.zeros(4, 2, 1), torch.ones(4, 2, 1, dtype=torch.bool)
     flags = dict.fromkeys((keys.ACTING, keys.DEPARTED), ones)

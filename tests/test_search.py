@@ -176,6 +176,23 @@ def test_a_damaged_record_of_a_search_is_told(any_optuna: None) -> None:
         make_plan(out="folder")
 
 
+def test_a_line_that_was_cut_off_ends_no_search(optuna: Any) -> None:
+    from mappo_unity.training.search.study import JOURNAL, SearchStudy
+
+    plan = make_plan(trials=4)
+    plan.folder.mkdir()
+    study = SearchStudy(plan)
+    study.suggest(study.ask())
+    journal = plan.folder / JOURNAL
+    whole = journal.read_bytes()
+    journal.write_bytes(whole + b'{"op_code": 4, "work')
+
+    again = SearchStudy(plan)
+    assert len(again.trials) == 1 and journal.read_bytes().startswith(whole)
+    again.ask()
+    assert len(SearchStudy(plan).trials) == 2
+
+
 def test_values_at_the_ends_of_the_space_are_tried_first(any_optuna: None) -> None:
     Path("space.yaml").write_text("ppo.gamma: {low: 0.9, high: 1.5}\n")
     with pytest.raises(ConfigError, match=r"ppo.gamma=1.5 is out of range.*in the trial ppo.gamma=1.5"):

@@ -254,6 +254,15 @@ def test_opening_rivals_draws_no_number_of_training(tmp_path):
     train(cfg, tmp_path / "run", after_iteration=look)
 
 
+def test_a_run_may_begin_with_a_past_policy_of_another(tmp_path, capsys):
+    train(matrix_game(2), tmp_path / "other")
+    past = sorted((tmp_path / "other" / "pool").glob("step_*.pt"))[-1]
+    assert train_main([*GAME, f"init_from={past}", "max_steps=64", f"hydra.run.dir={tmp_path / 'run'}"]) == 0
+    out = capsys.readouterr().out
+    assert "copied   actor.net.0.weight" in out
+    assert "skipped  critic " in out and "the file holds none: a new one learns" in out
+
+
 def test_elo_moves_as_in_ml_agents(tmp_path):
     state_of = []
     cfg = matrix_game(1)

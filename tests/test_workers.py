@@ -278,6 +278,20 @@ def test_statistics_that_move_with_each_round_have_seen_all_workers_when_a_batch
         torch.testing.assert_close(own.moving_norms[0].mean.double(), rows.mean(0), atol=1e-5, rtol=1e-5)
 
 
+def test_workers_learn_that_statistics_move_once_the_critic_is_warm(tmp_path: Path) -> None:
+    lines = ["env=3DBall", "env.num_areas=4", "collect.rounds=16", "collect.workers=2", LOCAL, ROUND, *SMALL]
+    lines.append("ppo.critic_warmup_steps=65")  # two batches of 64 decisions
+    with set_up(options(*lines), tmp_path) as setup, setup.collecting() as batches:
+        fleet: Any = setup.fleet
+        moving = []
+        for _ in range(4):
+            batch = next(batches)
+            (own,) = fleet._workers[1]._policy.actors.values()
+            moving.append(len(own.moving_norms))
+            setup.learn(batch, 0.0)
+    assert moving == [0, 0, 1, 1]
+
+
 # --- training and resuming
 
 

@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 
+import onnx
 import pytest
 
 from mappo_unity.cli import eval_main, play_main
@@ -38,6 +39,15 @@ def test_a_file_plays_its_scene(card):
     else:
         pytest.fail(f"{card['scene']} has no behavior {card['behavior']}")
     env.close()
+
+
+def test_a_file_that_takes_one_agent_at_a_time_is_told(tmp_path, capsys):
+    model = onnx.load(str(ZOO_FOLDER / "Basic.onnx"))
+    for entry in model.graph.input:
+        entry.type.tensor_type.shape.dim[0].dim_value = 1
+    onnx.save(model, str(tmp_path / "one.onnx"))
+    assert eval_main([f"run={tmp_path / 'one.onnx'}", "env=Basic", "episodes=4"]) == 2
+    assert "one.onnx cannot play 16 agents of 'Basic?team=0' at once: " in capsys.readouterr().err
 
 
 def test_zoo_evaluates_as_its_card_says(capsys):

@@ -21,7 +21,10 @@ from contextlib import suppress
 from mappo_unity.errors import ConfigError, EnvironmentFailure
 from mappo_unity.signals import interrupts_wait
 
-_NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+_NOT_OURS = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO),
+    errno.ENAMETOOLONG,
+)
 """What a file system refuses for reasons of its own."""
 
 
@@ -153,5 +156,5 @@ def _answer(command: str, name: str, lines: list[str]) -> int:
 
 def _drop_output() -> None:
     """Let what is still to be written to standard output go nowhere, also when Python ends."""
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, AttributeError):  # None where it was closed by `>&-`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

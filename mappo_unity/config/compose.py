@@ -54,14 +54,21 @@ class Composed:
 
     @property
     def run_dir(self) -> Path:
-        """Folder that hydra.run.dir names."""
-        return Path(str(OmegaConf.select(self.tree, "hydra.run.dir")))
+        """Folder that hydra.run.dir names; raises ConfigError."""
+        return _folder(self.tree, "hydra.run.dir")
 
     def sweep_dir(self, env_name: str) -> Path:
-        """Return the folder that hydra.sweep.dir names for jobs of the named environment."""
+        """Return the folder that hydra.sweep.dir names for jobs of an environment; raises ConfigError."""
         tree = self.tree.copy()
         tree.env.name = env_name
-        return Path(str(OmegaConf.select(tree, "hydra.sweep.dir")))
+        return _folder(tree, "hydra.sweep.dir")
+
+
+def _folder(tree: DictConfig, key: str) -> Path:
+    try:
+        return Path(str(OmegaConf.select(tree, key)))
+    except OmegaConfBaseException as error:  # of ${...} that names nothing
+        raise ConfigError(f"{key}: {_explain(error)}") from error
 
 
 def compose_config(lines: list[str], base: Path | None = None, file: Path | None = None) -> Composed:
@@ -184,7 +191,7 @@ def compose_plain(lines: list[str], schema: type) -> Any:
 
     # the first of the options that must be given
     for key in OmegaConf.missing_keys(tree):
-        option = option_table(schema)[key]
+        option = option_table(schema)[key.partition("[")[0]]
         raise ConfigError(f"{key} is not given: {key}=... ({option.description})")
 
     try:

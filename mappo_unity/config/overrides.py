@@ -234,7 +234,7 @@ def _check_type(key: str, value: Any, option: Option, schema: type) -> None:
     tree = OmegaConf.structured(schema) if option.is_open else _scratch(schema)
     try:
         OmegaConf.update(tree, key, value, merge=True, force_add=option.is_open)
-    except (OmegaConfBaseException, ValueError):
+    except (OmegaConfBaseException, ValueError, OverflowError):
         fits = False
     if fits:
         return

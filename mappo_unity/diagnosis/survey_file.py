@@ -19,4 +19,6 @@ def write_survey(folder: Path, facts: dict[str, Any]) -> None:
 
 def read_survey(folder: Path) -> dict[str, Any]:
     """Return what it says by policy name; nothing where it is missing or damaged."""
-    return read_json(folder / FILE)
+    found = read_json(folder / FILE)
+    is_whole = all(isinstance(facts, dict) and "decisions" in facts for facts in found.values())
+    return found if is_whole else {}

@@ -56,7 +56,12 @@ class OnnxPolicy:
         """Return an action for every row of ``steps``."""
         self.check(behavior, spec)
         branches = spec.action_spec.discrete_branches
-        outputs = self.session.run(list(self.outputs), self._feed(behavior, steps, spec))
+        feed = self._feed(behavior, steps, spec)
+        try:
+            outputs = self.session.run(list(self.outputs), feed)
+        except Exception as error:  # onnxruntime raises many kinds, without a common base
+            what = f"the ONNX file {self.path} cannot play {len(steps)} agents of {behavior!r} at once"
+            raise ConfigError(f"{what}: {str(error).strip().splitlines()[0][:300]}") from error
         out = dict(zip(self.outputs, outputs))
         if "recurrent_out" in out:
             memory = out["recurrent_out"].reshape(len(steps), -1)

@@ -158,4 +158,4 @@ def _starts(path: Path) -> list[dict[str, Any]]:
 
 def _by_numbers(path: Path) -> tuple[tuple[bool, int, str], ...]:
     """Sort job 10 of a sweep behind job 9."""
-    return tuple((not part.isdigit(), int(part) if part.isdigit() else 0, part) for part in path.parts)
+    return tuple((not part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in path.parts)

@@ -109,7 +109,9 @@ def findings(records: Sequence[Mapping[str, Any]]) -> str:
 def status(run: Run) -> str:
     """Return how a run ended: as its sweep notes it, unless it was resumed since; else by its decisions."""
     done, wanted = last(run, "agent_steps"), run.options.get("max_steps", "")
-    if "status" in run.result and not done > float(run.result.get("agent_steps") or math.inf):
+    noted = run.result.get("agent_steps")
+    is_older = isinstance(noted, (int, float)) and done > noted
+    if "status" in run.result and not is_older:
         return str(run.result["status"])
     if not wanted.isdigit():
         return "-"
@@ -190,7 +192,8 @@ def _best(run: Run) -> tuple[float, float]:
     if not np.isfinite(column).any():
         return math.nan, math.nan
 
-    window = float(run.options.get("log.return_window", "1"))
+    text = run.options.get("log.return_window", "1")
+    window = float(text) if text.isdecimal() else 1.0
     is_full = run.columns.get("episodes", np.full(len(column), math.inf)) >= window
     if np.isfinite(column[is_full]).any():
         column = np.where(is_full, column, math.nan)

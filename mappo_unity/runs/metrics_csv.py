@@ -68,7 +68,10 @@ def read_metrics(path: Path) -> list[dict[str, int | float]]:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist, or is not a file")
 
-    columns, rows = _read_table(path)
+    try:
+        columns, rows = _read_table(path)
+    except csv.Error as error:
+        raise ValueError(f"{path} is no table ({error})") from error
     return [
         {name: _number(cell, path, line) for name, cell in zip(columns, row, strict=True) if cell}
         for line, row in enumerate(rows, start=2)

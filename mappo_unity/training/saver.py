@@ -60,8 +60,11 @@ class CheckpointSaver:
         if won or is_over or self.last is None:
             self.save()
 
-    def save(self) -> None:
+    def save(self, is_regular: bool = True) -> None:
         """Write a checkpoint of the last complete iteration, unless there is one.
+
+        Args:
+            is_regular: the next ones are to come at intervals from this one.
 
         Raises:
             CheckpointError: it cannot be written.
@@ -73,7 +76,7 @@ class CheckpointSaver:
         best = state.is_best()
         if best:
             state.best_score = max(state.best_score, state.score())
-        if self.last is not None:  # the first one comes early and is not part of the rhythm
+        if self.last is not None and is_regular:  # the first one comes early and is not part of the rhythm
             state.saved_at = complete["agent_steps"]
         # both are known only now, and a resumed run needs them
         complete |= {"best_score": state.best_score, "saved_at": state.saved_at}
@@ -87,14 +90,15 @@ class CheckpointSaver:
 
     def finish(self) -> None:
         """Save what is not saved yet, and export the best and the last checkpoint."""
-        self.save()
+        # a run that is interrupted here goes on in its rhythm when it is resumed
+        self.save(is_regular=False)
         if self._exports is not None:
             self._exports.finish(self.last)
 
     def rescue(self, say: Callable[[str], None]) -> None:
         """Save the last complete iteration before an error or a second signal ends the run; say where."""
         try:
-            self.save()
+            self.save(is_regular=False)
         except ConfigError as error:
             say(str(error))
             return

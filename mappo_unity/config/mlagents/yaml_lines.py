@@ -50,13 +50,16 @@ def read_yaml(path: Path) -> Node:
     except (OSError, UnicodeError) as error:
         raise ConfigError(f"{path} cannot be read ({error})") from error
 
-    loader = yaml.SafeLoader(text)
     try:
+        loader = yaml.SafeLoader(text)
         root = loader.get_single_node()
         tree = Node({}, 1) if root is None else _node(path, loader, root)
     except yaml.MarkedYAMLError as error:
         raise ConfigError(_explain(path, text, error)) from error
-    except yaml.YAMLError as error:
+    except ConfigError:
+        raise
+    # of values such as the date 2026-02-30, and anchors that hold themselves
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path} is no YAML ({' '.join(str(error).split())})") from error
 
     if not isinstance(tree.value, dict):

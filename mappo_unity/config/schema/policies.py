@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Optional
 
-from mappo_unity.config.schema.checks import above, at_least, not_empty, rule, within
+from mappo_unity.config.schema.checks import above, at_least, at_most, not_empty, rule, within
 from mappo_unity.errors import ConfigError
 
 
@@ -101,6 +101,7 @@ class PlayConfig:
     def __post_init__(self) -> None:
         not_empty(run=self.run, env=self.env, policy=self.policy, video=self.video, record=self.record)
         above("seconds", self.seconds, 0)
+        at_most("seconds", self.seconds, 1e6)
         within("seed", self.seed, 0, 2**31 - 1)
 
         for option, size in (("width", self.width), ("height", self.height)):

@@ -61,7 +61,7 @@ class OnnxGraph:
         self.constants = {tensor.name: self._array(tensor) for tensor in graph.initializer}
         for node in graph.node:
             if node.op_type == "Constant":
-                self.constants[node.output[0]] = self._array(self.attributes(node)["value"])
+                self.constants[node.output[0]] = self._constant(self.attributes(node))
         self.inputs = {
             entry.name: [dim.dim_value for dim in entry.type.tensor_type.shape.dim[1:]]
             for entry in graph.input
@@ -69,6 +69,12 @@ class OnnxGraph:
         }
         self.outputs = [entry.name for entry in graph.output]
         self.metadata = {entry.key: entry.value for entry in self.model.metadata_props}
+
+    def _constant(self, attributes: dict[str, Any]) -> Any:
+        """Return what a Constant holds: a tensor, or numbers (value_float, value_ints ...)."""
+        if "value" in attributes:
+            return self._array(attributes["value"])
+        return np.array(next(iter(attributes.values()), []))
 
     def node(self, name: str) -> Any:
         """Return the node that made a name; None for an input or a constant."""

@@ -92,6 +92,17 @@ def read_network(path: Path) -> OnnxNetwork:
         ExportError: the package onnx is missing.
     """
     graph = OnnxGraph(path)
+    try:
+        return _read_network(graph)
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        # other programs write operators in other ways
+        raise ConfigError(f"{path}: its network is of a kind that cannot be read ({error!r})") from error
+
+
+def _read_network(graph: OnnxGraph) -> OnnxNetwork:
+    path = graph.path
     actions = read_actions(graph)
     mirror, image = asdict(MirrorConfig()), None
     if MIRROR in graph.metadata:

@@ -118,7 +118,10 @@ def _from_checkpoint(path: Path, name: str, learner: PolicyLearner) -> tuple[str
     theirs = name if name in known else known[0]
     saved = state["learners"][theirs]
     rows = copy_fitting(learner.actor, "actor", saved["actor"], {})
-    rows += _critic(learner, saved["critic"], by_stream(saved["value_norm"]))
+    if "critic" in saved:
+        rows += _critic(learner, saved["critic"], by_stream(saved["value_norm"]))
+    else:  # a past policy of self-play
+        rows.append(Row("critic", None, "the file holds none: a new one learns"))
     told = f"{path}" + (f", policy {theirs}" if theirs != name else "")
     model = model_from_saved(state["model"][theirs])
     return f"{told} ({int(state['agent_steps']):,} agent steps)", rows, model

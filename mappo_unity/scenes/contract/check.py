@@ -188,6 +188,9 @@ def main(arguments: list[str] | None = None) -> int:
         name = "" if str(error).startswith(f"{options.scene}: ") else f"{options.scene}: "
         print(f"{name}{error}", *error.details, sep="\n", file=sys.stderr)
         return 1 if isinstance(error, ContractError) else 2
+    except KeyboardInterrupt:
+        print(f"{options.scene}: interrupted", file=sys.stderr)
+        return 130
 
     print(*lines, _summary(options.scene, report), sep="\n")
     return 0

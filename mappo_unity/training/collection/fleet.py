@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from mappo_unity.config.parameters.samplers import Value
 from mappo_unity.config.schema import Config
 from mappo_unity.learning.networks.actor_critic import UnityActor
@@ -20,7 +22,7 @@ from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.training.collection.batches import Batch
 from mappo_unity.training.collection.description import Played
 from mappo_unity.training.collection.lineups import Lineup
-from mappo_unity.training.collection.worker import Weights, Worker, make_unity_env
+from mappo_unity.training.collection.worker import MOVES, Weights, Worker, make_unity_env
 
 
 class Fleet(ABC):
@@ -181,8 +183,11 @@ def move_norms(policy: JointPolicy, batch: Batch) -> None:
 
 
 def weights_of(policy: JointPolicy) -> dict[str, dict[str, Any]]:
-    """Return copies of all actors' tensors, on the CPU."""
-    return {
-        name: {key: value.detach().to("cpu", copy=True) for key, value in actor.state_dict().items()}
-        for name, actor in zip(policy.names, policy.actors.values())
-    }
+    """Return copies of all actors' tensors, on the CPU, and whether statistics move with each round."""
+    weights: dict[str, dict[str, Any]] = {}
+    for name, actor in zip(policy.names, policy.actors.values()):
+        own = {key: value.detach().to("cpu", copy=True) for key, value in actor.state_dict().items()}
+        if isinstance(actor, UnityActor):  # not while its critic warms up
+            own[MOVES] = torch.tensor(bool(actor.moving_norms))
+        weights[name] = own
+    return weights

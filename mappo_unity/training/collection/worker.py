@@ -17,7 +17,9 @@ from mappo_unity.envs.backends import make_env_function
 from mappo_unity.envs.following import followed
 from mappo_unity.envs.replay import make_replay_function
 from mappo_unity.envs.unity_env import UnityEnv
+from mappo_unity.learning.networks.actor_critic import UnityActor
 from mappo_unity.learning.networks.distributions import CONTINUOUS_LIMIT
+from mappo_unity.learning.networks.encoders import running_norms
 from mappo_unity.learning.networks.joint_policy import JointPolicy
 from mappo_unity.protocol.restarting_player import SEED_STRIDE
 from mappo_unity.runs.checkpoint import to_arrays
@@ -31,6 +33,8 @@ WORKER_STRIDE = 1_000_003
 """Worker n of several starts from the run's seed plus n times this (modulo 2^31)."""
 
 Weights = Mapping[str, Mapping[str, Tensor]]
+MOVES = "moving_norms"
+"""The entry of an actor's weights that says whether its statistics move with each round."""
 """An actor's `state_dict` by policy name."""
 
 
@@ -93,7 +97,12 @@ class Worker:
         assert self._policy is not None and self._batches is not None, "no policy to play with"
         if weights is not None:
             for name, actor in zip(self._policy.names, self._policy.actors.values()):
-                actor.load_state_dict(weights[name])
+                own = dict(weights[name])
+                moves = own.pop(MOVES, None)
+                actor.load_state_dict(own)
+                if moves is not None:  # weights that were saved by an older version do not say
+                    assert isinstance(actor, UnityActor)
+                    actor.moving_norms = running_norms(actor) if moves else []
 
         batch = next(self._batches)
         return Message(batch, self.state() if want_state else None)

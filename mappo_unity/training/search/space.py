@@ -7,7 +7,7 @@ model.hidden: [[64, 64], [128, 128]]
 
 from __future__ import annotations
 
-import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -171,7 +171,8 @@ def _range(key: str, raw: dict[Any, Any], kind: Any) -> Range:
 
     low, high, log = raw["low"], raw["high"], raw.get("log", False)
     for end in (low, high):
-        if isinstance(end, bool) or not isinstance(end, (int, float)) or not math.isfinite(end):
+        is_number = isinstance(end, (int, float)) and not isinstance(end, bool)
+        if not is_number or not abs(end) <= sys.float_info.max:
             raise ConfigError(f"{text}: {show_value(end)} is not a finite number")
         check_value(key, end, Config)
 

@@ -17,6 +17,7 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from mappo_unity.config.schema import Pruner, SearchObjective
+from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.training.search.messages import MARKS, TrialResult
 from mappo_unity.training.search.space import Range, to_line
 
@@ -120,6 +121,13 @@ class SearchStudy:
 
 
 def _storage(path: Path) -> JournalStorage:
+    """Open the trials' file, without a last line that was cut off by a full disk or a loss of power."""
+    if path.is_file():
+        data = path.read_bytes()
+        whole = data[: data.rfind(b"\n") + 1]
+        if whole != data:
+            write_atomically(path, whole)
+
     # a lock that works on every system: symbolic links need a right on Windows
     return JournalStorage(JournalFileBackend(str(path), lock_obj=JournalFileOpenLock(str(path))))
 
