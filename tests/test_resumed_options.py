@@ -21,6 +21,7 @@ from mappo_unity.policies.onnx_policy import OnnxPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import NewFolder, create_folder, discard_folder
 from mappo_unity.training.run_state import RunState
+from mappo_unity.training.saver import CheckpointSaver
 from mappo_unity.training.trainer import train
 
 
@@ -65,6 +66,23 @@ def test_an_interruption_does_not_move_the_rhythm_of_checkpoints(tmp_path: Path)
     train(cfg, tmp_path / "parts", path)
     assert names(tmp_path / "whole") == [f"step_{n * BATCH:012d}.pt" for n in (1, 3, 6, 9)]
     assert names(tmp_path / "parts") == [f"step_{n * BATCH:012d}.pt" for n in (1, 3, 4, 6, 9)]
+
+
+def test_a_checkpoint_that_an_error_made_late_keeps_the_rhythm(tmp_path: Path, monkeypatch: Any) -> None:
+    cfg = options(9, keep_checkpoints=20, checkpoint_interval=3 * BATCH, export_onnx=False)
+
+    def fail(saver: CheckpointSaver, won: bool) -> None:
+        if saver._state.iteration == 3:
+            raise RuntimeError("between the iteration and its checkpoint")
+        save_if_due(saver, won)
+
+    save_if_due = CheckpointSaver.save_if_due
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError):
+        patch.setattr(CheckpointSaver, "save_if_due", fail)
+        train(cfg, tmp_path)
+    path, _ = checkpoint.newest_good(tmp_path)
+    train(cfg, tmp_path, path)
+    assert names(tmp_path) == [f"step_{n * BATCH:012d}.pt" for n in (1, 3, 6, 9)]
 
 
 def test_decisions_that_are_pending_do_not_outlive_another_ratio() -> None:

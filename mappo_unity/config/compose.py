@@ -191,8 +191,8 @@ def compose_plain(lines: list[str], schema: type) -> Any:
 
     # the first of the options that must be given
     for key in OmegaConf.missing_keys(tree):
-        option = option_table(schema)[key.partition("[")[0]]
-        raise ConfigError(f"{key} is not given: {key}=... ({option.description})")
+        name = key.partition("[")[0]  # runs[0] of ???, which a shell leaves where no file has such a name
+        raise ConfigError(f"{name} is not given: {name}=... ({option_table(schema)[name].description})")
 
     try:
         return OmegaConf.to_object(tree)

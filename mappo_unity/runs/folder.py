@@ -49,9 +49,9 @@ def create_folder(wanted: Path, exact: bool = False) -> NewFolder:
     With `exact` (the user named it) the folder may exist if it is empty, and no other name will do.
     Raises ConfigError where it cannot be made or written.
     """
-    parents = [parent for parent in reversed(wanted.parents) if not parent.exists()]
-
+    parents: list[Path] = []
     try:
+        parents += [parent for parent in reversed(wanted.parents) if not parent.exists()]
         wanted.parent.mkdir(parents=True, exist_ok=True)
         folder = NewFolder(_claim(wanted, exact), tuple(parents))
         # A folder that was there may refuse files.

@@ -76,7 +76,9 @@ class CheckpointSaver:
         best = state.is_best()
         if best:
             state.best_score = max(state.best_score, state.score())
-        if self.last is not None and is_regular:  # the first one comes early and is not part of the rhythm
+        # the first one comes early, and one of an interruption at any time: they are not part of the rhythm
+        is_due = complete["agent_steps"] - state.saved_at >= self._cfg.checkpoint_interval
+        if self.last is not None and (is_regular or is_due):
             state.saved_at = complete["agent_steps"]
         # both are known only now, and a resumed run needs them
         complete |= {"best_score": state.best_score, "saved_at": state.saved_at}

@@ -94,7 +94,7 @@ def read_network(path: Path) -> OnnxNetwork:
     graph = OnnxGraph(path)
     try:
         return _read_network(graph)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
         if isinstance(error, ConfigError):
             raise
         # other programs write operators in other ways

@@ -33,9 +33,9 @@ WORKER_STRIDE = 1_000_003
 """Worker n of several starts from the run's seed plus n times this (modulo 2^31)."""
 
 Weights = Mapping[str, Mapping[str, Tensor]]
+"""An actor's `state_dict` by policy name, and `MOVES`."""
 MOVES = "moving_norms"
 """The entry of an actor's weights that says whether its statistics move with each round."""
-"""An actor's `state_dict` by policy name."""
 
 
 class Message(NamedTuple):
