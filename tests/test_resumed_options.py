@@ -102,6 +102,31 @@ def test_decisions_that_are_pending_do_not_outlive_another_ratio() -> None:
     assert len(component.join(batch)) == 4
 
 
+def test_the_best_one_of_a_way_that_is_not_taken_is_no_longer_the_best(tmp_path: Path, capsys: Any) -> None:
+    cfg = options(6, keep_checkpoints=20, export_onnx=False)
+    train(cfg, tmp_path)
+    folder = tmp_path / "checkpoints"
+    (folder / "best.pt").unlink()
+    shutil.copy(folder / names(tmp_path)[-1], folder / "best.pt")
+    (folder / "best.onnx").write_text("of the best")
+    early = folder / names(tmp_path)[1]
+
+    outcome = train(cfg, tmp_path, early, lambda state: "interrupted")
+    assert "the best one until now is of later steps, too, and lies in" in capsys.readouterr().out
+    aside = folder / "abandoned_1"
+    assert checkpoint.load(aside / "best.pt")["agent_steps"] == 6 * BATCH
+    assert (aside / "best.onnx").read_text() == "of the best"
+    assert outcome.best_checkpoint is not None
+    assert checkpoint.load(outcome.best_checkpoint)["agent_steps"] <= 3 * BATCH
+
+    # one that cannot be read is none
+    (folder / "best.pt").unlink()
+    (folder / "best.pt").write_bytes(b"cut off")
+    path, _ = checkpoint.newest_good(tmp_path)
+    train(cfg, tmp_path, path, lambda state: "interrupted")
+    assert checkpoint.load(folder / "best.pt")["agent_steps"] <= 4 * BATCH
+
+
 def test_the_best_checkpoint_keeps_its_opponents(tmp_path: Path) -> None:
     cfg = matrix_game(9, keep_checkpoints=1)
     cfg = replace(cfg, self_play=replace(cfg.self_play, window=1, play_against_latest_model_ratio=0.0))

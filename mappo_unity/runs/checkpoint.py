@@ -99,7 +99,8 @@ def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, be
 def set_aside_later(folder: Path, resumed: Path, agent_steps: int) -> list[str]:
     """Move checkpoints later than the one that a run goes on from out of its way, to ``abandoned_N/``.
 
-    They belong to a way that is not taken: among them new ones would count as old.
+    They belong to a way that is not taken: among them new ones would count as old. Where the best one is of
+    that way, the one that the run goes on from is the best.
 
     Args:
         folder: the run's.
@@ -110,7 +111,9 @@ def set_aside_later(folder: Path, resumed: Path, agent_steps: int) -> list[str]:
         A line for the user, where there are any.
     """
     later = [path for path in checkpoints_in(folder) if step_of(path) > agent_steps]
-    if not later:
+    best = folder / FOLDER / BEST
+    is_best_later = best.exists() and not _is_up_to(best, agent_steps)
+    if not later and not is_best_later:
         return []
 
     # The best one may be known by that name alone; a run resumes from numbered ones.
@@ -124,7 +127,27 @@ def set_aside_later(folder: Path, resumed: Path, agent_steps: int) -> list[str]:
     aside.mkdir()
     for path in later:
         os.replace(path, aside / path.name)
-    return [f"{len(later)} later checkpoints, up to {step_of(later[-1]):,} steps, were moved to {aside}"]
+    lines = []
+    if later:
+        many = f"{len(later)} later checkpoints, up to {step_of(later[-1]):,} steps"
+        lines.append(f"{many}, were moved to {aside}")
+    if not is_best_later:
+        return lines
+
+    for path in best.parent.glob(f"{best.stem}*"):  # its ONNX files, too
+        os.replace(path, aside / path.name)
+    copy = best.with_name(f".{BEST}.{os.getpid()}.tmp")
+    shutil.copy2(own, copy)
+    os.replace(copy, best)
+    return [*lines, f"the best one until now is of later steps, too, and lies in {aside}"]
+
+
+def _is_up_to(path: Path, agent_steps: int) -> bool:
+    """Return whether a checkpoint can be read and is of so many steps at most."""
+    try:
+        return int(load(path)["agent_steps"]) <= agent_steps
+    except CheckpointError:
+        return False
 
 
 def load(path: Path) -> dict[str, Any]:
