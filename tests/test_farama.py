@@ -31,7 +31,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from mappo_unity import gym_env, make_scene, parallel_env, vector_env
 from mappo_unity.cli import player_main
 from mappo_unity.errors import ConfigError
-from mappo_unity.farama import session
+from mappo_unity.farama import parallel, session, vector
 from mappo_unity.farama.session import Session
 from mappo_unity.scenes.contract.rules import EnvironmentDataError
 
@@ -329,7 +329,8 @@ class Empty(Hybrid):
 
 @pytest.mark.parametrize("make", [parallel_env, vector_env])
 def test_an_environment_in_which_nobody_asks_again_is_told(make: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(session, "MAX_SILENT_STEPS", 20)
+    for module in (parallel, vector):
+        monkeypatch.setattr(module, "MAX_SILENT_STEPS", 20)
     env = make(Empty())
     env.reset()
     actions = dict.fromkeys(env.agents, GO) if make is parallel_env else env.action_space.sample()

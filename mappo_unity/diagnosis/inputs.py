@@ -22,15 +22,15 @@ def from_inputs(evidence: Evidence) -> Iterator[Finding]:
         return
 
     for name, facts in evidence.survey.items():
-        if not facts["decisions"] and facts.get("opposed"):
-            continue  # it is not its turn yet: opponents play all of its teams
         if not facts["decisions"]:
-            yield Finding(
-                "never asked",
-                f"{name} is never asked for a decision",
-                f"0 of {amount(total)} decisions are its own",
-                "are its agents active, with a DecisionRequester and Behavior Type Default?",
-            )
+            # where opponents have played its teams it may be that its turn has not come
+            if not facts.get("opposed"):
+                yield Finding(
+                    "never asked",
+                    f"{name} is never asked for a decision",
+                    f"0 of {amount(total)} decisions are its own",
+                    "are its agents active, with a DecisionRequester and Behavior Type Default?",
+                )
             continue
         yield from _observations(evidence, name, facts)
         yield from _masks(name, facts)

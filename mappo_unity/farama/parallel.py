@@ -10,9 +10,10 @@ from mlagents_envs.base_env import DecisionSteps, TerminalSteps
 from pettingzoo import ParallelEnv
 
 from mappo_unity.errors import ConfigError
-from mappo_unity.farama.session import Session, check_silence
+from mappo_unity.farama.session import Session
 from mappo_unity.farama.spaces import BehaviorSpaces
 from mappo_unity.keys import policy_name
+from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_silence
 
 Result = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict]]
 
@@ -106,7 +107,7 @@ class AgentsEnv(ParallelEnv):
         tick = _Tick()
         silent = 0
         while self.agents and not (tick.ended or tick.asked):
-            check_silence(silent)
+            check_silence(silent, MAX_SILENT_STEPS)
             silent += 1
             records = self._session.step(self._actions(actions))
             actions = {}  # for the first of these steps only

@@ -14,12 +14,7 @@ from mappo_unity.config.text_lines import literal_lines
 from mappo_unity.envs.backends import MakeEnv, make_env_function
 from mappo_unity.envs.opening import First, first_results
 from mappo_unity.errors import ConfigError
-from mappo_unity.scenes.contract.rules import (
-    MAX_SILENT_STEPS,
-    check_same_specs,
-    note_silence,
-    silence_error,
-)
+from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_same_specs
 
 
 class Session:
@@ -103,10 +98,3 @@ class Session:
         self._env.reset()
         self._is_fresh = False
         return first_results(self._env, MAX_SILENT_STEPS)
-
-
-def check_silence(steps: int) -> None:
-    """Say once that nobody has anything to do for long; raise EnvironmentDataError after far longer."""
-    note_silence(steps, MAX_SILENT_STEPS)
-    if steps >= MAX_SILENT_STEPS:
-        raise silence_error(steps)

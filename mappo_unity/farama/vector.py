@@ -10,8 +10,9 @@ from gymnasium.vector.utils import batch_space
 from mlagents_envs.base_env import ActionTuple, DecisionSteps, TerminalSteps
 
 from mappo_unity.errors import ConfigError
-from mappo_unity.farama.session import Session, check_silence
+from mappo_unity.farama.session import Session
 from mappo_unity.farama.spaces import BehaviorSpaces
+from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_silence
 
 Result = tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 
@@ -79,7 +80,7 @@ class AgentsVectorEnv(VectorEnv):
 
         silent = 0
         while not asked.any():
-            check_silence(silent)
+            check_silence(silent, MAX_SILENT_STEPS)
             silent += 1
             sent = {name: self._rows_of(name, d, actions) for name, d in self._requests.items() if len(d)}
             records = self._session.step(sent)

@@ -26,7 +26,7 @@ from mappo_unity.learning.advantage import approximate_kl, last_mean, make_view,
 from mappo_unity.learning.carried import VALUED, CarriedRounds, has_value
 from mappo_unity.learning.imitation.cloning import Cloning
 from mappo_unity.learning.loss import ACTOR_LEARNS, MaskedClipPPOLoss, move_with_minibatch
-from mappo_unity.learning.networks.actor_critic import Actor, UnityActor, value_layers
+from mappo_unity.learning.networks.actor_critic import UnityActor, bounded_actors, value_layers
 from mappo_unity.learning.networks.encoders import channels_first, running_norms, update_norms
 from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.optimizer import (
@@ -88,7 +88,7 @@ class PolicyLearner:
 
         self.prepared: PreparedBatch | None = None  # while it is learnt, with ppo.recompute_advantages
         self.value_layers = value_layers(critic)  # which PopArt rescales
-        self.bounded = [m for m in actor.modules() if isinstance(m, Actor)]
+        self.bounded = bounded_actors(actor)
         self.norms = [*running_norms(actor), *running_norms(critic)]
         self.round_norms = running_norms(actor) if cfg.obs_norm_update is ObsNormUpdate.round else []
         self.actor.moving_norms = self.warmup.free(self.round_norms)

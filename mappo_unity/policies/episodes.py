@@ -12,7 +12,7 @@ from mappo_unity.envs.rounds import Episode
 from mappo_unity.errors import EnvironmentFailure
 from mappo_unity.policies.policy import Policy
 from mappo_unity.scenes.contract.records import RecordCheck
-from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_specs, note_silence, silence_error
+from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_silence, check_specs
 
 MAX_ENV_STEPS = 5_000_000
 NUM_BATCHES = 40  # of consecutive episodes, at most
@@ -60,9 +60,7 @@ def play(
         counts.skips = counts.skips and not {*names} <= {name for name, _ in running}
         if names and counts.complete(names):
             return counts.ended
-        note_silence(silent, MAX_SILENT_STEPS)
-        if silent >= MAX_SILENT_STEPS:
-            raise silence_error(silent)
+        check_silence(silent, MAX_SILENT_STEPS)
         env.step()
 
     raise _endless(env, episodes, counts)

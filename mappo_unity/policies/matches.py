@@ -24,12 +24,7 @@ from mappo_unity.keys import policy_name
 from mappo_unity.policies.episodes import play
 from mappo_unity.policies.layouts import check_two_sides
 from mappo_unity.policies.policy import Policy
-from mappo_unity.scenes.contract.rules import (
-    MAX_SILENT_STEPS,
-    has_snapshots,
-    note_silence,
-    silence_error,
-)
+from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_silence, has_snapshots
 
 Z95 = 1.959964  # two-sided 95 % quantile of the standard normal distribution
 
@@ -146,15 +141,15 @@ def count_members(env: BaseEnv, behavior: str) -> int | None:
     Raises:
         EnvironmentDataError: it never may.
     """
-    for steps in range(MAX_SILENT_STEPS):
-        groups = env.get_steps(behavior)[0].group_id
-        if len(groups):
-            # group 0 is none: without teams the match of an agent is its own episode
-            sizes = np.bincount(groups)[1:]
-            return int(sizes.max()) if sizes.any() else None
-        note_silence(steps, MAX_SILENT_STEPS)
+    steps = 0
+    while not len(groups := env.get_steps(behavior)[0].group_id):
+        check_silence(steps, MAX_SILENT_STEPS)
         env.step()
-    raise silence_error(MAX_SILENT_STEPS)
+        steps += 1
+
+    # group 0 is none: without teams the match of an agent is its own episode
+    sizes = np.bincount(groups)[1:]
+    return int(sizes.max()) if sizes.any() else None
 
 
 def count(episodes: list[Episode], members: int | None) -> Score:

@@ -112,8 +112,9 @@ def set_aside_later(folder: Path, resumed: Path, agent_steps: int) -> list[str]:
     """
     later = [path for path in checkpoints_in(folder) if step_of(path) > agent_steps]
     best = folder / FOLDER / BEST
-    is_best_later = best.exists() and not _is_up_to(best, agent_steps)
-    if not later and not is_best_later:
+    is_of_later = best.exists() and not _is_up_to(best, agent_steps)
+    files_of_best = list(best.parent.glob(f"{best.stem}*")) if is_of_later else []  # its ONNX files, too
+    if not later and not files_of_best:
         return []
 
     # The best one may be known by that name alone; a run resumes from numbered ones.
@@ -125,21 +126,17 @@ def set_aside_later(folder: Path, resumed: Path, agent_steps: int) -> list[str]:
     while (aside := folder / FOLDER / f"abandoned_{next(numbers)}").exists():
         pass
     aside.mkdir()
-    for path in later:
+    for path in [*later, *files_of_best]:
         os.replace(path, aside / path.name)
+
     lines = []
     if later:
         many = f"{len(later)} later checkpoints, up to {step_of(later[-1]):,} steps"
         lines.append(f"{many}, were moved to {aside}")
-    if not is_best_later:
-        return lines
-
-    for path in best.parent.glob(f"{best.stem}*"):  # its ONNX files, too
-        os.replace(path, aside / path.name)
-    copy = best.with_name(f".{BEST}.{os.getpid()}.tmp")
-    shutil.copy2(own, copy)
-    os.replace(copy, best)
-    return [*lines, f"the best one until now is of later steps, too, and lies in {aside}"]
+    if files_of_best:
+        write_atomically(best, own.read_bytes())
+        lines.append(f"the best one until now is of later steps, too, and lies in {aside}")
+    return lines
 
 
 def _is_up_to(path: Path, agent_steps: int) -> bool:

@@ -41,13 +41,17 @@ def check_place(folder: Path, resume: bool, force: bool) -> None:
             f"no run to resume in {folder}: {other}leave --resume out to start a run, or "
             "--initialize-from=RUN to begin with another one's networks"
         )
-    is_taken = folder.is_dir() and any(folder.iterdir()) and not resume and not force
-    if is_taken and not is_unbegun(folder):
+
+    is_taken = not resume and folder.is_dir() and any(folder.iterdir())
+    # what a first start left that failed is emptied by the run that begins there
+    if is_taken and not force and not is_unbegun(folder):
         raise ConfigError(
             f"{folder} holds a previous run: give another --run-id, --resume to go on with it, or --force to "
             "replace it"
         )
-    if force and not resume and folder.is_dir() and any(folder.iterdir()):
+
+    # --force is for runs, not for whatever else may lie there
+    if is_taken and force:
         if not is_run and not (folder / CONFIGURATION).is_file():
             raise ConfigError(f"{folder} holds no run that --force could replace: give another --run-id")
 

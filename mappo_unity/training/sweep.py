@@ -11,6 +11,7 @@ import math
 import signal
 import time
 import traceback
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -150,10 +151,7 @@ def _run_job(tree: DictConfig) -> float | None:
         result.status = "interrupted"
         ended_by = getattr(error, "signal", int(signal.SIGINT))
     except Exception as error:
-        folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
-        result.error = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-        (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
-        result.agent_steps = steps_of(folder)
+        note_failure(result, folder, error)
 
     # Whatever became of the job: its result is there before a signal goes on to the sweep.
     result.wall_s = round(result.wall_s or time.monotonic() - start_s, 3)
@@ -165,12 +163,15 @@ def _run_job(tree: DictConfig) -> float | None:
     return result.return_mean
 
 
-def steps_of(folder: Path) -> int | None:
-    """Return the decisions that the metrics of a job that failed have come to; None: they cannot be read."""
-    try:
-        return int(read_metrics(folder / METRICS)[-1][STEP])
-    except (OSError, ValueError, LookupError):
-        return None
+def note_failure(result: JobResult, folder: Path, error: Exception) -> None:
+    """Enter an error that is being handled into a job's result, and write its traceback to error.txt."""
+    folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
+    result.error = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
+    (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
+
+    # who resumes the job goes on from here
+    with suppress(OSError, ValueError, LookupError):
+        result.agent_steps = int(read_metrics(folder / METRICS)[-1][STEP])
 
 
 def varied_options(jobs: list[JobResult]) -> list[str]:

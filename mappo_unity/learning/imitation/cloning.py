@@ -16,7 +16,7 @@ from torch import Tensor
 from mappo_unity.config.schema import BCConfig, PPOConfig
 from mappo_unity.learning.advantage import share_left
 from mappo_unity.learning.imitation.expert import Expert
-from mappo_unity.learning.networks.actor_critic import Actor, UnityActor
+from mappo_unity.learning.networks.actor_critic import UnityActor, bounded_actors
 from mappo_unity.learning.networks.distributions import ActionDistribution
 from mappo_unity.learning.optimizer import kind_of, load_optimizer
 
@@ -40,7 +40,7 @@ class Cloning:
         self._max_steps = max_steps
         # epsilon stays torch's, as in ML-Agents
         self.optimizer = kind_of(ppo)(actor.parameters(), lr=ppo.lr, weight_decay=ppo.weight_decay)
-        self._bounded = [module for module in actor.modules() if isinstance(module, Actor)]
+        self._bounded = bounded_actors(actor)
         self._pieces = _cut(expert.first, ppo.sequence_length if actor.is_recurrent else 1)
 
     def learn(self, decisions: int, lr: float, progress: float) -> dict[str, float]:

@@ -91,6 +91,11 @@ class Actor(nn.Module):
         return bounded + (self.log_std - self.log_std.detach())
 
 
+def bounded_actors(net: nn.Module) -> list[Actor]:
+    """Return the networks of a policy that are to `project` after each step of an optimizer."""
+    return [module for module in net.modules() if isinstance(module, Actor)]
+
+
 class PerMember(nn.Module):
     """A network for each member of a team: member ``a`` gets column ``a`` of its own network's output.
 

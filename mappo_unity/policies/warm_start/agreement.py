@@ -18,7 +18,7 @@ from mappo_unity.policies.onnx_policy import fit_image, open_session
 from mappo_unity.policies.warm_start.onnx_network import OnnxNetwork
 
 CHECKED_ROWS = 64
-TOLERANCE = 1e-4  # of means / 3, of log-probabilities (of larger ones: of their size), of the memory
+TOLERANCE = 1e-5  # of means / 3, of log-probabilities (of larger ones: of their size), of the memory
 
 
 @torch.no_grad()

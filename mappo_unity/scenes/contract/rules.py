@@ -154,6 +154,13 @@ def note_silence(steps: int, limit: int) -> None:
         )
 
 
+def check_silence(steps: int, limit: int) -> None:
+    """Say once that nobody has anything to do for so many steps; raise EnvironmentDataError at the limit."""
+    note_silence(steps, limit)
+    if steps >= limit:
+        raise silence_error(steps)
+
+
 def silence_error(steps: int) -> EnvironmentDataError:
     """Return the error of an environment in which nobody requests a decision any more."""
     return EnvironmentDataError(

@@ -198,17 +198,21 @@ class RemoteWorkers(SeveralWorkers):
                     f"worker {number} was replaced, but its new environment shows other behaviors, sensors, "
                     "actions or team slots; env.max_teams and env.max_team_size give room for more agents"
                 )
+
             values = self.lessons_in_force()
             messages: list[tuple[Any, ...]] = [("set_parameter", *item) for item in values.items()]
             messages += [("restart",)] if values else []  # its first episodes began without them
             messages += [("take", *self._policy)] if self._policy is not None else []
             messages += [("oppose", self._lineups.sent)] if self._lineups.sent is not None else []
+
             for message in messages:
                 process.send(*message)
                 process.receive()
         except BaseException:
             process.end()
             raise
+
+        # it knows the past policies of the newest lineup, and none that was told before
         self._lineups.forget()
         return process
 

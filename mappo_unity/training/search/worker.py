@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import time
-import traceback
 from collections.abc import Callable
 from dataclasses import asdict
 from multiprocessing.connection import Connection
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config, SearchObjective
-from mappo_unity.errors import ConfigError
 from mappo_unity.policies.warm_start.sources import adopt_file_options
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.folder import checkpoint_of_job, write_record
@@ -21,7 +19,7 @@ from mappo_unity.runs.lock import locked
 from mappo_unity.scenes.factory import check_factory
 from mappo_unity.training.child_process import begin_child
 from mappo_unity.training.search.messages import GO, MARKS, PRUNE, Run, Task, TrialResult
-from mappo_unity.training.sweep import RESULT, JobResult, steps_of
+from mappo_unity.training.sweep import RESULT, JobResult, note_failure
 
 if TYPE_CHECKING:
     from mappo_unity.training.outcome import Outcome
@@ -62,10 +60,7 @@ def run_trial(task: Task, report: Report) -> TrialResult:
             result.status = "stopped"
             break
         except Exception as error:
-            run.folder.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
-            job.error = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-            (run.folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
-            job.agent_steps = steps_of(run.folder)
+            note_failure(job, run.folder, error)
             outcome = None
 
         _write(run, job)
