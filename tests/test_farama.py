@@ -129,6 +129,7 @@ def test_a_vector_is_the_scene_itself() -> None:
 @pytest.mark.parametrize("scene", ["Basic", "WallJump"])
 def test_vectors_stay_in_their_spaces(scene: str) -> None:
     env = vector_env(scene, num_areas=4, seed=2)
+    env.action_space.seed(2)  # else few episodes end now and then
     seen, infos = env.reset(seed=2)
     ends = 0
     for _ in range(150):
