@@ -83,7 +83,7 @@ def test_each_kind_of_entry_is_read() -> None:
 @pytest.mark.parametrize("name", spaces())
 def test_shipped_spaces_fit_the_presets(name: str, any_optuna: None) -> None:
     plan = make_plan("env=3DBall", search=name)
-    assert plan.space and plan.max_steps == 500_000
+    assert plan.space and plan.max_steps == 400_000
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_a_grid_runs_every_combination_and_ranks_them(capsys: pytest.CaptureFixt
         "overrides": ["seed=1", "ppo.lr=0.0003", "env.params.mass=2"],
         "status": "finished",
         "return_mean": 0.7,
-        "agent_steps": 500_000,  # the preset of 3DBall
+        "agent_steps": 400_000,  # the preset of 3DBall
         "wall_s": 0.5,
         "error": None,
     }
