@@ -2,6 +2,7 @@
 
 import csv
 import math
+import shutil
 import sys
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ import torch
 from onnx_fakes import official_policy, run_policy
 from tensordict import TensorDict
 
-from mappo_unity.cli import eval_main, export_main
+from mappo_unity.cli import eval_main, export_main, train_main
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.extras import install_command
 from mappo_unity.config.schema import CollectConfig, Config, EnvConfig, LogConfig, ModelConfig, PPOConfig
@@ -74,6 +75,28 @@ def test_a_run_leaves_its_best_and_its_final_policy(tiny_run):
     best = OnnxPolicy(folder / "best.onnx", deterministic=True)
     assert best.agent_steps == checkpoint.load(folder / "best.pt")["agent_steps"]
     assert not [p for p in folder.iterdir() if p.suffix not in (".pt", ".onnx")]  # no temporary files
+
+
+def test_a_run_that_was_broken_off_before_its_last_export_gets_it_by_resuming(tiny_run, tmp_path, capsys):
+    run = shutil.copytree(tiny_run, tmp_path / "run")
+    final = run / "checkpoints" / "final.onnx"
+    written = final.read_bytes()
+    assert train_main([f"resume={run}"]) == 0
+    assert "nothing to train, and nothing was changed" in capsys.readouterr().out
+
+    for left in (None, b"half a file", (run / "checkpoints" / "best.onnx").read_bytes()[:-1]):
+        final.unlink()
+        if left is not None:
+            final.write_bytes(left)
+        assert train_main([f"resume={run}"]) == 0
+        said = capsys.readouterr().out
+        assert "nothing to train, and its last ONNX files, which were missing, were written: the run" in said
+        assert final.read_bytes() == written
+
+    # one that wants no files gets none
+    final.unlink()
+    assert train_main([f"resume={run}", "export_onnx=false"]) == 0
+    assert "nothing was changed" in capsys.readouterr().out and not final.exists()
 
 
 def test_an_export_plays_the_scene_as_its_checkpoint(tiny_run):

@@ -523,6 +523,41 @@ def test_a_run_is_not_overwritten_but_resumed_and_replaced(trained, tmp_path, mo
     assert os.listdir("results") == ["first"]
 
 
+def test_a_run_that_was_broken_off_at_its_very_end_is_published_by_resuming_it(
+    trained, tmp_path, monkeypatch, capsys
+):
+    import shutil
+
+    shutil.copytree(trained, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    run, resume = Path("results/first"), ["my.yaml", "--run-id=first", "--resume", *SMALL[1:]]
+    final = run / "checkpoints" / "final.onnx"
+    played = final.read_bytes()
+
+    assert learn_main(resume) == 0
+    out = capsys.readouterr().out
+    assert "nothing to train, and nothing was changed" in out and "policy:" not in out
+
+    # killed between the last checkpoint and the files
+    final.unlink()
+    (run / "3DBall.onnx").write_bytes(b"an older one")
+    (run / "run_logs" / "training_status.json").unlink()
+    assert learn_main(resume) == 0
+    out = capsys.readouterr().out
+    assert "nothing to train, and its last ONNX files, which were missing, were written" in out
+    assert f"policy: {run / '3DBall.onnx'}" in out
+    assert final.read_bytes() == played == (run / "3DBall.onnx").read_bytes()
+    status = yaml.safe_load((run / "run_logs" / "training_status.json").read_text())
+    assert status["3DBall"]["final_checkpoint"]["steps"] == 480
+
+    # killed between the checkpoints' files and those of ML-Agents
+    (run / "3DBall.onnx").unlink()
+    assert learn_main(resume) == 0
+    out = capsys.readouterr().out
+    assert "nothing was changed" in out and f"policy: {run / '3DBall.onnx'}" in out
+    assert (run / "3DBall.onnx").read_bytes() == played
+
+
 def test_what_a_resumed_run_keeps_is_told(trained, tmp_path, monkeypatch, capsys):
     import shutil
 

@@ -244,19 +244,25 @@ def _launch(settings: Settings, lines: list[str], folder: Path) -> int:
     outcome = launched.outcome
     if outcome is None:
         print(launched.message)
+        if launched.last_checkpoint is not None:
+            _say_published(results.publish_late(folder, launched.last_checkpoint))
         return 0
 
     steps = outcome.agent_steps
     written = results.publish(folder, outcome.last_checkpoint, policies, outcome.return_mean, steps)
     print(f"finished: {steps:,} agent steps in {outcome.wall_s:.1f} s, mean return {outcome.return_mean:.4g}")
-    for path in written:
-        print(f"policy: {path}")
+    _say_published(written)
     print(f"curves: tensorboard --logdir {folder.parent}", flush=True)
     if outcome.signal is None:
         return _MOST_ROLLED_BACK if outcome.status == "diverged" else 0
     name = signal.Signals(outcome.signal).name
     print(f"mappo-learn: ended by {name}; --resume goes on", file=sys.stderr)
     return 128 + outcome.signal
+
+
+def _say_published(written: list[Path]) -> None:
+    for path in written:
+        print(f"policy: {path}")
 
 
 def _play(settings: Settings, folder: Path, deterministic: bool) -> int:

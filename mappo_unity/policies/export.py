@@ -19,9 +19,10 @@ from tensordict import TensorDictBase
 
 from mappo_unity import keys
 from mappo_unity.config.packages import ExportError
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.onnx_check import compare
 from mappo_unity.policies.onnx_graph import build_model
-from mappo_unity.policies.onnx_policy import SUFFIX, file_name
+from mappo_unity.policies.onnx_policy import SUFFIX, OnnxPolicy, file_name
 from mappo_unity.policies.policy import CheckpointPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.atomic import write_atomically
@@ -141,6 +142,15 @@ class RunExports:
         if last is not None:
             self._export(last.name, FINAL)
 
+    def is_behind(self, agent_steps: int) -> bool:
+        """Return whether ``final.onnx``, or one of several such files, is not of the last checkpoint.
+
+        Args:
+            agent_steps: of the last checkpoint.
+        """
+        files = list(self.folder.glob(f"{Path(FINAL).stem}*{SUFFIX}"))
+        return not files or any(_steps_of(path) != agent_steps for path in files)
+
     def _export(self, name: str, out: str | None = None) -> None:
         path = self.folder / name
         if not path.is_file():
@@ -158,6 +168,14 @@ class RunExports:
 
 
 # --- files
+
+
+def _steps_of(path: Path) -> int | None:
+    """Return the agent steps that an ONNX file says its policy has learnt from; None: it cannot be read."""
+    try:
+        return OnnxPolicy(path, deterministic=True).agent_steps
+    except ConfigError:
+        return None
 
 
 def _output_paths(names: list[str], path: Path, out: Path | None) -> dict[str, Path]:

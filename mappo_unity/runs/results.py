@@ -19,9 +19,10 @@ import yaml
 from mappo_unity import keys
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
-from mappo_unity.runs.checkpoint_file import FOLDER
-from mappo_unity.runs.folder import CONFIG, LOGS, is_unbegun
+from mappo_unity.runs.checkpoint_file import FOLDER, read_plain
+from mappo_unity.runs.folder import CONFIG, LOGS, METRICS, is_unbegun
 from mappo_unity.runs.lock import locked
+from mappo_unity.runs.metrics_csv import read_metrics
 
 CONFIGURATION = "configuration.yaml"
 _SUFFIX = ".onnx"
@@ -133,9 +134,7 @@ def publish(
 
     written, status = [], {}
     for policy in policies:
-        stem = keys.file_stem(policy)  # of "My Behavior" My_Behavior
-        found = [checkpoint.with_name(name) for name in (f"final_{stem}{_SUFFIX}", f"final{_SUFFIX}")]
-        source = next((path for path in found if path.is_file()), None)
+        source = _final_file(checkpoint, policy)
         if source is None:  # no ONNX file could be written, which has been said
             continue
 
@@ -159,3 +158,35 @@ def publish(
     text = json.dumps({**status, "metadata": {"trainer": "mappo-unity"}}, indent=2)
     write_atomically(folder / LOGS / "training_status.json", f"{text}\n".encode())
     return written
+
+
+def publish_late(folder: Path, checkpoint: Path) -> list[Path]:
+    """Publish what a run that is over has not, since it was broken off at its very end.
+
+    Args:
+        folder: of the run.
+        checkpoint: the last one.
+
+    Returns:
+        The files ``folder/BEHAVIOR.onnx``; none where they stand as they are to be.
+    """
+    state = read_plain(checkpoint)
+    policies = list(state["learners"])
+    if all(_is_published(folder, policy, _final_file(checkpoint, policy)) for policy in policies):
+        return []
+
+    rows = read_metrics(folder / METRICS)
+    reward = rows[-1]["return_mean"] if rows else math.nan
+    return publish(folder, checkpoint, policies, float(reward), state["agent_steps"])
+
+
+def _final_file(checkpoint: Path, policy: str) -> Path | None:
+    """Return the ONNX file of a behavior in which a run ended, where there is one."""
+    stem = keys.file_stem(policy)  # of "My Behavior" My_Behavior
+    found = [checkpoint.with_name(name) for name in (f"final_{stem}{_SUFFIX}", f"final{_SUFFIX}")]
+    return next((path for path in found if path.is_file()), None)
+
+
+def _is_published(folder: Path, policy: str, source: Path | None) -> bool:
+    newest = folder / f"{policy}{_SUFFIX}"
+    return source is None or (newest.is_file() and newest.read_bytes() == source.read_bytes())

@@ -35,11 +35,15 @@ Warn = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Launched:
-    """What became of a run: its folder and outcome; where nothing was left to train, a message instead."""
+    """What became of a run: its folder and outcome.
+
+    Where nothing was left to train, a message and the last checkpoint stand instead of the outcome.
+    """
 
     folder: Path
     outcome: Outcome | None
     message: str = ""
+    last_checkpoint: Path | None = None
 
 
 def launch(
@@ -117,8 +121,11 @@ def _resume(lines: list[str], path: Path, warn: Warn, show: _Show) -> Launched:
     with _locked(folder, warn):
         checkpoint, over = _newest_checkpoint(config, path if path.is_file() else folder, warn)
         if over is not None:
-            message = f"nothing to train, and nothing was changed: the run in {folder} is over: {over}"
-            return Launched(folder, None, message)
+            what = "nothing was changed"
+            if not path.is_file() and _catch_up(config, folder, checkpoint, warn):
+                what = "its last ONNX files, which were missing, were written"
+            message = f"nothing to train, and {what}: the run in {folder} is over: {over}"
+            return Launched(folder, None, message, checkpoint)
 
         # the record says how the run was trained: a resume that wrote no checkpoint puts the old one back
         record = runs.read_record(folder)
@@ -140,6 +147,23 @@ def _newest_checkpoint(config: Config, source: Path, warn: Warn) -> tuple[Path, 
     for warning in warnings:
         warn(warning)
     return checkpoint, why_over(config, checkpoint)
+
+
+def _catch_up(config: Config, folder: Path, last: Path, warn: Warn) -> bool:
+    """Write the last ONNX files of a run that was broken off before them; return whether any were missing."""
+    if not config.export_onnx:
+        return False
+
+    with interrupts_wait():
+        from mappo_unity.policies.export import RunExports
+        from mappo_unity.runs.checkpoint import load
+
+    exports, agent_steps = RunExports(folder, warn, is_resumed=True), load(last)["agent_steps"]
+    if not exports.is_behind(agent_steps):
+        return False
+
+    exports.finish(last)
+    return not exports.is_behind(agent_steps)
 
 
 @contextmanager
