@@ -228,8 +228,9 @@ def _memory_explained(cfg: Config) -> Iterator[None]:
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
+        areas = "" if cfg.env.num_areas is None else f"env.num_areas={cfg.env.num_areas}, "
         raise ConfigError(
-            f"memory ran out ({' '.join(str(error).split()) or type(error).__name__}); lower "
+            f"memory ran out ({' '.join(str(error).split()) or type(error).__name__}); lower {areas}"
             f"collect.batch_size={cfg.collect.batch_size}, ppo.minibatch_size={cfg.ppo.minibatch_size} or "
             f"model.hidden={list(cfg.model.hidden)}"
         ) from error
