@@ -86,6 +86,10 @@ def test_shipped_spaces_fit_the_presets(name: str, any_optuna: None) -> None:
     assert plan.space and plan.max_steps == 400_000
 
 
+def test_the_space_of_a_preset_holds_it_so_that_a_search_begins_there(any_optuna: None) -> None:
+    assert make_plan("env=3DBall", search="3DBall").preset is not None
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
