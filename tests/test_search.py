@@ -232,22 +232,22 @@ def test_the_first_trial_is_the_preset_and_the_later_ones_lie_in_the_space(optun
     plan = make_plan("env=3DBall", trials=12)
     plan.folder.mkdir()
     study = SearchStudy(plan)
-    assert study.suggest(study.ask()) == ["ppo.lr=0.001", "ppo.epochs=4"]  # conf/env/3DBall.yaml
+    assert study.suggest(study.ask()) == ["ppo.lr=0.003", "ppo.epochs=3"]  # conf/env/3DBall.yaml
     for _ in range(11):
         config = compose_config(study.suggest(study.ask())).config
         assert 1e-4 <= config.ppo.lr <= 1e-2 and 1 <= config.ppo.epochs <= 8
 
 
 def test_a_preset_outside_of_the_space_is_no_trial(any_optuna: None) -> None:
-    assert make_plan("env=3DBall").preset == {"ppo.lr": 1e-3, "ppo.epochs": 4}
+    assert make_plan("env=3DBall").preset == {"ppo.lr": 3e-3, "ppo.epochs": 3}
     Path("space.yaml").write_text("ppo.epochs: {low: 5, high: 8}\n")
     assert make_plan("env=3DBall").preset is None
 
 
 def result_of(lines: list[str], plan: SearchPlan) -> TrialResult:
-    """Return a made-up result: the return falls with the distance of ppo.lr from 3e-3, in decades."""
+    """Return a made-up result: the return falls with the distance of ppo.lr from 1e-3, in decades."""
     rate = float(dict(line.split("=") for line in lines)["ppo.lr"])
-    distance = abs(math.log10(rate / 3e-3))
+    distance = abs(math.log10(rate / 1e-3))
     is_return = plan.objective is SearchObjective.final_return
     return TrialResult("complete", [-distance if is_return else 1000 * distance], -distance, 100, 1.0)
 
@@ -265,9 +265,9 @@ def test_trials_come_near_the_best(goal: float | None, optuna: Any) -> None:
 
     rows = rows_of(study.trials, plan)
     rates = [float(row.lines[0].partition("=")[2]) for row in rows]
-    assert abs(math.log10(rates[0] / 3e-3)) < 0.1  # the preset's 1e-3 is 0.48 away
-    assert [abs(math.log10(rate / 3e-3)) for rate in rates] == sorted(
-        abs(math.log10(rate / 3e-3)) for rate in rates
+    assert abs(math.log10(rates[0] / 1e-3)) < 0.1  # the preset's 3e-3 is 0.48 away
+    assert [abs(math.log10(rate / 1e-3)) for rate in rates] == sorted(
+        abs(math.log10(rate / 1e-3)) for rate in rates
     )
 
 
