@@ -156,9 +156,9 @@ def _catch_up(config: Config, folder: Path, last: Path, warn: Warn) -> bool:
 
     with interrupts_wait():
         from mappo_unity.policies.export import RunExports
-        from mappo_unity.runs.checkpoint import load
+        from mappo_unity.runs.checkpoint_file import step_of
 
-    exports, agent_steps = RunExports(folder, warn, is_resumed=True), load(last)["agent_steps"]
+    exports, agent_steps = RunExports(folder, warn, is_resumed=True), step_of(last)
     if not exports.is_behind(agent_steps):
         return False
 
