@@ -84,6 +84,10 @@ TOLD = [
     ),
     (f"train env=Basic {ONLY} stop_at_return=1", "stop_at_return=1 does not go with bc.only=true"),
     (
+        f"train env=Basic {ONLY} ppo.critic_warmup_steps=9",
+        "ppo.critic_warmup_steps=9 does not go with bc.only=true",
+    ),
+    (
         f"train env=Basic {ONLY} matches.interval=9",
         "matches.interval=9: matches need an environment with two",
     ),

@@ -241,13 +241,13 @@ def test_the_price_of_information_rises_while_there_is_too_much_of_it() -> None:
     model = Discriminator(ObsLayout(3), ActionLayout.from_spec(spec), cfg, expert)
 
     prices = []
-    for mean in (0.0, 10.0):  # KL to a standard normal: 0, and 50 nats for each of its numbers
+    for mean in (0.0, 10.0):  # KL to a standard normal: 0, and 50 nats for each of its numbers, twice
         torch.nn.init.zeros_(model.mean.weight)
         torch.nn.init.constant_(model.mean.bias, mean)
         model.beta.fill_(0.5)
         model.loss(expert.steps)
         prices.append(float(model.beta))
-    surplus = np.array([0.0, 50.0 * len(model.mean.bias)]) - INFORMATION
+    surplus = np.array([0.0, 2 * 50.0 * len(model.mean.bias)]) - INFORMATION  # the expert's and the policy's
     assert prices == pytest.approx(0.5 + BETA_STEP * surplus)
 
 

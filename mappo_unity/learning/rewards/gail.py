@@ -80,7 +80,7 @@ class Discriminator(nn.Module):
         if not self.cfg.use_vail:
             return loss
 
-        information = 0.5 * (self._information(expert_mean) + self._information(policy_mean))
+        information = self._information(expert_mean) + self._information(policy_mean)  # ML-Agents' sum
         price = self.beta.clone()
         self.beta.add_(BETA_STEP * (information.detach() - INFORMATION)).clamp_(min=0.0)
         return loss + price * (information - INFORMATION)
