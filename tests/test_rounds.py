@@ -168,7 +168,9 @@ def test_a_departed_member_that_begins_anew_ends_as_it_was():
         ]
     )
     rows = play(env, 3)
-    assert [row[0] for row in read(rows, "next", "terminated")] == [False, True, True]
+    # its team earned on while it was away, so that the value of that goes on
+    assert [row[0] for row in read(rows, "next", "terminated")] == [False, False, True]
+    assert [row[0] for row in read(rows, "next", "truncated")] == [False, True, False]
     assert [row[0] for row in read(rows, "next", "obs_0")] == [0, 0, 8]
     assert [row[0] for row in read(rows, "next", "departed")] == [True, True, False]
     assert rows["next", "Fake", "present"].all()

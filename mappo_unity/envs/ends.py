@@ -39,14 +39,21 @@ class RoundEnds:
         zeros = [np.zeros((len(rows), *shape), np.float32) for shape in shapes]
         self._ends.append(End(rows, zeros, departed=True))
 
-    def returning(self, rows: np.ndarray, shapes: list[tuple[int, ...]]) -> None:
-        """Note members that departed and begin anew before their team has ended."""
+    def returning(self, rows: np.ndarray, shapes: list[tuple[int, ...]]) -> np.ndarray:
+        """Note members that departed and begin anew before their team has ended.
+
+        Returns:
+            bool ``[n]``, those that departed in this very round.
+        """
         self.departed(rows, shapes)
 
         # who departed in this very round has its terminal observation in it
+        just_left = np.zeros(len(rows), bool)
         for slots, observations in self._departures:
             back = np.isin(slots, rows)
             self.playing(slots[back], [o[back] for o in observations])
+            just_left |= np.isin(rows, slots)
+        return just_left
 
     def write(self, obs: list[np.ndarray], present: np.ndarray, departed: np.ndarray) -> None:
         """Write what was noted into observations ``[N, *shape]`` and flags ``[N]``."""

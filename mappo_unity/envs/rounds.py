@@ -233,10 +233,14 @@ class BehaviorState:
             o[rows] = 0
 
     def _end_departed(self, rows: np.ndarray) -> None:
-        """End the old episodes of departed slots that begin anew before their team has ended."""
+        """End the old episodes of departed slots that begin anew before their team has ended.
+
+        Their team earns on, and the value of that goes on with it: who departed earlier is cut off.
+        """
         if len(rows):
-            self.terminated[rows] = True
-            self._ends.returning(rows, self._shapes)
+            just_left = self._ends.returning(rows, self._shapes)
+            self.terminated[rows[just_left]] = True
+            self.truncated[rows[~just_left]] = True
 
     def _end_teams(self, rows: np.ndarray, interrupted: np.ndarray) -> None:
         """Members that departed earlier end with their team's last members `rows`, and as these do."""
