@@ -375,6 +375,19 @@ def test_what_shapes_do_not_show_is_said(run: Path, tmp_path: Path, capsys: Any)
     assert "value_norm" not in out
 
 
+def test_values_that_are_not_normalised_are_not_read_as_such(tmp_path: Path, capsys: Any) -> None:
+    lines = [*TINY, "ppo.normalize_values=none", f"output_dir={tmp_path / 'raw'}"]
+    assert train_main(lines) == 0
+    raw = run_of(tmp_path / "raw")
+    for kind, is_copied in (("running", False), ("popart", True)):
+        lines = [*TINY, f"init_from={raw}", f"ppo.normalize_values={kind}", f"output_dir={tmp_path / kind}"]
+        capsys.readouterr()
+        assert train_main(lines) == 0
+        out = capsys.readouterr().out
+        assert ("its values are not normalised, here they are" in out) != is_copied
+        assert ("copied   critic.net.0.weight" in out) == is_copied
+
+
 def test_a_run_that_began_warm_resumes_without_its_source(run: Path, tmp_path: Path) -> None:
     source = tmp_path / "source"
     shutil.copytree(run, source)

@@ -12,7 +12,14 @@ from typing import Any
 
 from mappo_unity.config.option_table import show_value
 from mappo_unity.config.per_behavior import behavior_config, init_source
-from mappo_unity.config.schema import Config, DistributionKind, MemoryKind, ModelConfig, show_mirror
+from mappo_unity.config.schema import (
+    Config,
+    DistributionKind,
+    MemoryKind,
+    ModelConfig,
+    ValueNormKind,
+    show_mirror,
+)
 from mappo_unity.errors import ConfigError
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.learning.value_norm import by_stream
@@ -132,6 +139,11 @@ def _critic(learner: PolicyLearner, saved: dict[str, Any], statistics: dict[str,
     if not learner.value_norm.enabled and float(statistics["debias"]) > 0:
         return [
             Row("critic", None, "its values are normalised, here they are not (ppo.normalize_values=none)")
+        ]
+    # PopArt rescales the last layer as its statistics move away from 0 and 1; nothing else does
+    if learner.cfg.normalize_values is ValueNormKind.running and not float(statistics["debias"]):
+        return [
+            Row("critic", None, "its values are not normalised, here they are (ppo.normalize_values=running)")
         ]
 
     critic = copy_fitting(learner.critic, "critic", saved, {})
