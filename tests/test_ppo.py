@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from mappo_unity.config.schema import (
     Activation,
+    BCConfig,
     CriticKind,
     ModelConfig,
     ObsNormUpdate,
@@ -386,6 +387,51 @@ def test_a_normaliser_that_moves_with_each_round_stands_still_while_the_critic_w
         assert one.actor.moving_norms == []
         one.learn(*whole(batch), 0.0)
         assert len(one.actor.moving_norms) == 1  # the critic has learnt its steps
+
+
+def test_cloning_waits_while_the_critic_warms_up():
+    class Clone:
+        cfg, learnt = BCConfig(demos=["x"]), 0
+
+        def learn(self, *_):
+            self.learnt += 1
+            return {}
+
+    learner = make_learner(critic_warmup_steps=T * G * A)
+    learner.cloning = clone = Clone()
+    before = copy.deepcopy(learner.actor.state_dict())
+    learner.learn(*whole(make_batch(learner)), 0.0)
+    assert clone.learnt == 0
+    assert all(torch.equal(before[name], value) for name, value in learner.actor.state_dict().items())
+
+    learner.learn(*whole(make_batch(learner)), 0.0)
+    assert clone.learnt == 1
+
+
+def test_a_poca_critic_reads_what_waiting_mates_are_doing():
+    learner = make_learner(model={"critic": CriticKind.poca})
+    asked = torch.ones(T, G, A, 1, dtype=torch.bool)
+    asked[1::2, :, 1] = False  # the second member acts for two rounds
+    batch = make_batch(learner, asked)
+    seen, drawn = learner.reader.with_actions_under_way(batch)["action"], batch["action"]
+    assert torch.equal(seen[1::2, :, 1], drawn[::2, :, 1])
+    assert torch.equal(seen[::2], drawn[::2]) and torch.equal(seen[:, :, 0], drawn[:, :, 0])
+
+    # over the border of batches, and after a resume
+    resumed = make_learner(model={"critic": CriticKind.poca})
+    resumed.load_state_dict(learner.state_dict())
+    later = make_batch(learner, asked.roll(1, 0))
+    for one in (learner, resumed):
+        assert torch.equal(one.reader.with_actions_under_way(later)["action"][0, :, 1], drawn[-2, :, 1])
+
+    # what was drawn for members that wait changes nothing
+    other = batch.clone()
+    other["action"] = torch.where(asked, batch["action"], 99.0)
+    one, two = (prepared(copy.deepcopy(learner), b) for b in (batch, other))
+    assert torch.equal(one["advantage"], two["advantage"])
+
+    local = make_learner()
+    assert local.reader.with_actions_under_way(batch) is batch
 
 
 def test_a_ratio_of_each_component_is_clipped_by_itself():

@@ -127,7 +127,7 @@ class PolicyLearner:
             metrics |= self.rewards.learn()
             self.prepared = None
             self.rows.forget()
-        if self.cloning is not None:
+        if self.cloning is not None and not self.warmup.active:
             metrics |= self.cloning.learn(int(batch.get(keys.ACTING).sum()), settings["lr"], progress)
         if not self.round_norms:
             # after the update, which must not see it
@@ -141,7 +141,7 @@ class PolicyLearner:
     ) -> tuple[ReplayBuffer | None, dict[str, float]]:
         """Add advantages and targets; return a buffer of the rows that are learnt, None if there are none."""
         batch, following = self.reader.traced(batch, following)
-        rounds = self.carried.join(batch)
+        rounds = self.carried.join(self.reader.with_actions_under_way(batch))
         values = self.reader.read(rounds, following)
 
         ended = rounds.get(keys.TERMINATED) | rounds.get(keys.TRUNCATED)

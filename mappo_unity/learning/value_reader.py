@@ -1,7 +1,7 @@
 """What a critic says of a batch: values of its rows, of terminal observations, of the row after the last.
 
 With a memory the rounds are gone through one by one, and each slot's state is kept for the next batch; so are
-traces of what it observed.
+traces of what it observed, and for a critic that reads actions the one that is under way.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ class ValueReader:
         self.critic, self.norm = critic.module, norm
         self.keys = [str(key) for key in critic.in_keys]
         self.traces = next((m for m in critic.modules() if isinstance(m, ObservationTraces)), None)
+        self._reads_actions = any(isinstance(m, PocaCritic) for m in critic.modules())
         self.states: dict[str, Tensor] = {}  # [..., A, M], before the next batch's first row
         self._before: dict[str, Tensor] = {}  # those before the batch that was read last
 
@@ -75,6 +76,29 @@ class ValueReader:
             keys.CUT_OFF: cut_off.copy().set(keys.TRACES, ended),
         }
         return batch.copy().set(keys.TRACES, rows), following.copy().update(after)
+
+    @torch.no_grad()
+    def with_actions_under_way(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return a batch in which members that were not asked show what they are doing, for a POCA critic.
+
+        What the policy drew for such a member in this round is not played: it goes on with the action that
+        it chose when it was asked last.
+
+        Args:
+            batch: ``[T, ..., A]``, as collected.
+        """
+        if not self._reads_actions:
+            return batch
+
+        acting, drawn = batch.get(keys.ACTING), batch.get(keys.ACTION)
+        waits = batch.get(keys.PRESENT) & ~batch.get(keys.DEPARTED) & ~acting
+        under_way, rows = self._state(keys.ACTION, drawn[0], drawn.shape[-1]), []
+        for asked, waiting, action in zip(acting, waits, drawn, strict=True):
+            under_way = torch.where(asked, action, under_way)
+            rows.append(torch.where(waiting, under_way, action))
+
+        self.states[keys.ACTION] = under_way
+        return batch.copy().set(keys.ACTION, torch.stack(rows)) if bool(waits.any()) else batch
 
     @torch.no_grad()
     def read(self, rounds: TensorDict, following: TensorDictBase) -> Values:
