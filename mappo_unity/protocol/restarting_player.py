@@ -139,6 +139,11 @@ class RestartingPlayer(BaseEnv):
 
     def set_actions(self, behavior_name: str, action: ActionTuple) -> None:
         """Set the actions of all agents in the last decision steps, in their order."""
+        if behavior_name in self._specs and behavior_name not in self.player.behavior_specs:
+            # the new player has not shown it yet: none of its agents has requested a decision
+            self._specs[behavior_name].action_spec._validate_action(action, 0, behavior_name)
+            return
+
         self.player.set_actions(behavior_name, action)
 
     def set_action_for_agent(self, behavior_name: str, agent_id: int, action: ActionTuple) -> None:
@@ -158,7 +163,7 @@ class RestartingPlayer(BaseEnv):
             self._failures_in_a_row = 0
 
         specs = self.player.behavior_specs
-        if len(specs) > len(self._specs):
+        if any(name not in self._specs for name in specs):
             self._specs = BehaviorMapping({**self._specs, **specs})
 
         for name in specs:
