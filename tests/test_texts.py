@@ -276,8 +276,32 @@ def test_a_player_is_found_in_a_folder_of_any_letters(folder: str, name: str, tm
     player.write_text("#!/bin/sh\n")
     player.chmod(0o755)
     assert find_executable(str(player)) == player
-    if folder != "old.x86 builds":  # from which ML-Agents takes the extension, wherever it stands
-        assert find_executable(str(player.with_suffix(""))) == player
+    assert find_executable(str(player.with_suffix(""))) == player
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="players have other extensions there")
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("linux.x86_64/Game.x86_64", None),
+        ("linux.x86_64/Game", "linux.x86_64/Game.x86_64"),
+        ("b/Game.x86", None),
+        ("b/Game", None),
+        ("b/Other", "b/Other.x86_64"),
+        ("my.app.builds/Game", None),
+        ("linux/Game.exe", "linux/Game"),  # as ML-Agents takes it
+    ],
+)
+def test_a_player_of_just_that_name_is_taken(name: str, found: str | None, tmp_path: Path) -> None:
+    for player in (
+        *("linux.x86_64/Game.x86_64", "linux/Game", "b/Game", "b/Game.x86", "b/Game.x86_64"),
+        *("b/Other.x86", "b/Other.x86_64", "my.app.builds/Game"),
+    ):
+        path = tmp_path / player
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("#!/bin/sh\n")
+        path.chmod(0o755)
+    assert find_executable(str(tmp_path / name)) == tmp_path / (found or name)
 
 
 def test_an_output_in_ascii_ends_no_run(training: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:

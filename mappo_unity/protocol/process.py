@@ -57,8 +57,13 @@ def find_executable(file_name: str, option: str = "env.file_name") -> Path:
     # before ML-Agents looks: to it a broken link is just a missing file
     _check_link(path, f"{option}={file_name}")
 
-    # ML-Agents takes the name for a pattern; where that finds nothing, its brackets are letters
-    matched = validate_environment_path(str(path)) or validate_environment_path(glob.escape(str(path)))
+    # The exact name first: ML-Agents takes extensions out of a path wherever they stand. It takes a name
+    # for a pattern, too; where that finds nothing, its brackets are letters.
+    matched = (
+        _exactly(path)
+        or validate_environment_path(str(path))
+        or validate_environment_path(glob.escape(str(path)))
+    )
     place = Path(matched or path)
     if not place.is_file():
         kinds = {"darwin": ".app", "win32": ".exe"}.get(sys.platform, ".x86_64, .x86, or no extension")
@@ -78,6 +83,13 @@ def find_executable(file_name: str, option: str = "env.file_name") -> Path:
         raise ConfigError(f"{option}={file_name}: {found} cannot be run on this system: {reason}")
 
     return found
+
+
+def _exactly(path: Path) -> str | None:
+    """Return the file that a path names, as it is or with this system's extension; None if there is none."""
+    extensions = {"darwin": (), "win32": (".exe",)}.get(sys.platform, (".x86_64", ".x86"))
+    names = [f"{path}{extension}" for extension in ("", *extensions)]
+    return next(filter(os.path.isfile, names), None)
 
 
 def _check_link(path: Path, what: str) -> None:
