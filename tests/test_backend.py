@@ -496,6 +496,9 @@ class TestRegistry:
         path.write_text(
             f"environments:\n- Ball:\n{entry}    linux_url: {archive.as_uri()}\n"
             f"- Broken:\n{entry}    linux_url: {(tmp_path / 'absent.zip').as_uri()}\n"
+            f"- Heavy:\n{entry}    linux_url: {archive.as_uri()}\n"
+            "    additional_args: [--param, mass=3, --level, 3]\n"
+            f"- Text:\n{entry}    linux_url: {archive.as_uri()}\n    additional_args: --level 3\n"
         )
         return path
 
@@ -507,12 +510,31 @@ class TestRegistry:
         env.close()
         assert not capfd.readouterr().out
 
+    def test_an_entry_s_arguments_come_behind_the_command_line_s(
+        self, registry: Path, tmp_path: Path
+    ) -> None:
+        cfg = EnvConfig(
+            name="Heavy",
+            backend=Backend.registry,
+            registry=str(registry),
+            player_args=["--speed", "5"],
+            player_logs=str(tmp_path / "logs"),
+        )
+        env = make_env_function(cfg)(0)
+        env.close()
+        assert isinstance(env, RestartingPlayer)
+        assert env.player.options.arguments == ["--speed", "5", "--param", "mass=3", "--level", "3"]
+        log = (tmp_path / "logs" / "Player-0.log").read_text()
+        assert "accepted and without effect" in log and "--speed 5 --level 3" in log
+
     def test_entries_that_do_not_exist_or_give_nothing(self, registry: Path, tmp_path: Path) -> None:
         cfg = {"backend": Backend.registry, "registry": str(registry)}
-        with pytest.raises(ConfigError, match="has no entry 'Bal'; choices: Ball, Broken"):
+        with pytest.raises(ConfigError, match="has no entry 'Bal'; choices: Ball, Broken, Heavy, Text"):
             make_env_function(EnvConfig(registry_entry="Bal", **cfg))  # type: ignore[arg-type]
         with pytest.raises(ConfigError, match="entry 'Broken'.*absent.zip gives no player"):
             make_env_function(EnvConfig(registry_entry="Broken", **cfg))  # type: ignore[arg-type]
+        with pytest.raises(ConfigError, match="additional_args is '--level 3'; it must be a list"):
+            make_env_function(EnvConfig(registry_entry="Text", **cfg))  # type: ignore[arg-type]
         with pytest.raises(ConfigError, match="cannot be read"):
             make_env_function(EnvConfig(backend=Backend.registry, registry=str(tmp_path / "no.yaml")))
 

@@ -87,7 +87,9 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
     from mappo_unity.protocol.parallel_players import SeveralPlayers
     from mappo_unity.protocol.restarting_player import RestartingPlayer
 
-    executable = find_player(cfg)
+    executable, own_args = find_player(cfg)
+    # in ML-Agents' order: an entry's arguments come behind those of the command line
+    arguments = [*cfg.player_args, *own_args]
     folder = _log_folder(cfg, log_folder)
 
     def start(number: int, seed: int) -> RestartingPlayer:
@@ -101,7 +103,8 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
         def make_player(own_seed: int) -> UnityPlayer:
             restart = next(restarts)
             log_name = f"Player-{number}-restart-{restart}.log" if restart else f"Player-{number}.log"
-            return UnityPlayer(_player_options(cfg, executable, folder / log_name), own_seed)
+            player_options = _player_options(cfg, executable, arguments, folder / log_name)
+            return UnityPlayer(player_options, own_seed)
 
         return RestartingPlayer(make_player, first, cfg.max_restarts, name)
 
@@ -124,7 +127,9 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
     return make
 
 
-def _player_options(cfg: EnvConfig, executable: Path | None, log_file: Path) -> PlayerOptions:
+def _player_options(
+    cfg: EnvConfig, executable: Path | None, arguments: list[str], log_file: Path
+) -> PlayerOptions:
     from mappo_unity.protocol.player_options import PlayerOptions
 
     return PlayerOptions(
@@ -133,7 +138,7 @@ def _player_options(cfg: EnvConfig, executable: Path | None, log_file: Path) -> 
         # only the Editor must be told its port; for players the system picks a free one (0)
         port=cfg.port or EDITOR_PORT if cfg.backend is Backend.editor else 0,
         timeout_s=cfg.timeout_s,
-        arguments=list(cfg.player_args),
+        arguments=arguments,
         no_graphics=cfg.no_graphics,
         num_areas=cfg.num_areas or 1,
         parameters=values_at(cfg.parameters, {}),
@@ -141,8 +146,8 @@ def _player_options(cfg: EnvConfig, executable: Path | None, log_file: Path) -> 
     )
 
 
-def find_player(cfg: EnvConfig) -> Path | None:
-    """Return the executable that the options name; None for the Editor.
+def find_player(cfg: EnvConfig) -> tuple[Path | None, list[str]]:
+    """Return the executable that the options name, None for the Editor, and a registry entry's arguments.
 
     Raises:
         ConfigError: there is no such player or registry entry.
@@ -150,14 +155,14 @@ def find_player(cfg: EnvConfig) -> Path | None:
     from mappo_unity.protocol.process import find_executable
 
     if cfg.backend is Backend.editor:
-        return None
+        return None, []
 
     if cfg.backend is Backend.registry:
         from mappo_unity.protocol.registry import fetch_player
 
         return fetch_player(cfg.registry, cfg.registry_entry or cfg.name)
 
-    return find_executable(str(cfg.file_name))
+    return find_executable(str(cfg.file_name)), []
 
 
 def _engine(cfg: EnvConfig) -> dict[str, Any]:

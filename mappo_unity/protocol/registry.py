@@ -17,12 +17,12 @@ from mappo_unity.protocol.process import find_executable
 _URLS = {"darwin": "_darwin_url", "win32": "_win_url"}
 
 
-def fetch_player(registry: str, entry: str) -> Path:
-    """Return the executable of a registry's entry, fetched and unpacked if it is not there yet.
+def fetch_player(registry: str, entry: str) -> tuple[Path, list[str]]:
+    """Return an entry's executable, fetched and unpacked if it is not there yet, and the entry's arguments.
 
     Raises:
-        ConfigError: no such registry or entry (lists those that exist), no player for this system, or the
-            archive cannot be fetched.
+        ConfigError: no such registry or entry (lists those that exist), no player for this system,
+            arguments that are no list, or the archive cannot be fetched.
     """
     from mlagents_envs.registry.binary_utils import get_local_binary_path
 
@@ -37,6 +37,14 @@ def fetch_player(registry: str, entry: str) -> Path:
     if url is None:
         raise ConfigError(f"entry {entry!r} of env.registry={registry} has no player for {sys.platform}")
 
+    # they choose the scene where one build serves several entries
+    arguments = entries[entry]._add_args or []
+    if not isinstance(arguments, list):
+        raise ConfigError(
+            f"entry {entry!r} of env.registry={registry}: additional_args is {arguments!r}; it must be a "
+            "list, such as [--level, 3]"
+        )
+
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # its progress bars
             path = get_local_binary_path(entry, url)
@@ -46,7 +54,7 @@ def fetch_player(registry: str, entry: str) -> Path:
             f"entry {entry!r} of env.registry={registry}: {url} gives no player: {reason}"
         ) from error
 
-    return find_executable(path, f"registry entry {entry}")
+    return find_executable(path, f"registry entry {entry}"), [str(argument) for argument in arguments]
 
 
 def _entries(registry: str) -> dict[str, Any]:
