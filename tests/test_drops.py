@@ -122,7 +122,8 @@ def test_evaluation_begins_another_one_though_some_episodes_did_not_count() -> N
 def test_a_behavior_that_a_player_shows_late_is_refused() -> None:
     env = fragile([[Record(0)]] * 5, 99, ())
     env.base_env.specs["Late?team=0"] = behavior_spec()
-    with pytest.raises(ConfigError, match="'Late.team=0' appeared after the start, when there were .'Fake"):
+    start, cure = "appeared after the start, when there were .'Fake", "request a decision in the first step"
+    with pytest.raises(ConfigError, match=f"'Late.team=0' {start}.* every behavior must {cure} after"):
         idle(env, 1)
 
 

@@ -117,7 +117,8 @@ def check_same_specs(specs: Any, first: Mapping[str, BehaviorSpec]) -> None:
         if name not in first:
             raise EnvironmentDataError(
                 f"behavior {name!r} appeared after the start, when there were {list(first)}: "
-                "its networks cannot be made any more; let every behavior have an active agent at first"
+                "its networks cannot be made any more; every behavior must request a decision in the first "
+                "step after the reset, or be in behavior_specs from then on"
             )
 
 
