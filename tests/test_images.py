@@ -145,13 +145,13 @@ def test_only_unmarked_images_are_marked() -> None:
     assert marked.observation_specs == [vector, image(SHAPES[0], LAST), first]
 
 
-@pytest.mark.parametrize("flags", [(SILENT,) * 3, FIRST, LAST, (NONE,) * 3])
-def test_a_served_scene_says_what_it_means_by_an_unmarked_image(flags: tuple[DimensionProperty, ...]) -> None:
+@pytest.mark.parametrize("flags", [(SILENT,) * 3, FIRST, LAST, (NONE,) * 3, None])
+def test_a_served_scene_says_what_it_means_by_an_unmarked_image(flags: Any) -> None:
     install()  # before the messages of mlagents_envs
     from mlagents_envs.communicator_objects.observation_pb2 import ObservationProto
 
     sent = ObservationProto.FromString(_description(image(SHAPES[0], flags)))
-    assert tuple(sent.dimension_properties) == (FIRST if flags == (SILENT,) * 3 else flags)
+    assert tuple(sent.dimension_properties) == (FIRST if flags in ((SILENT,) * 3, None) else flags)
 
 
 @pytest.mark.parametrize(("flags", "last"), [(FIRST, False), (LAST, True)])

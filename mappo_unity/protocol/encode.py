@@ -207,7 +207,7 @@ def _head_layout(mask_size: int) -> Layout:
 
 def _description(sensor: ObservationSpec) -> bytes:
     """Return the fields of ObservationProto that never change."""
-    flags = [int(flag.value) for flag in sensor.dimension_property]
+    flags = [int(flag) for flag in sensor.dimension_property or ()]
     if len(sensor.shape) == 3 and not any(flags):
         flags = [1, 2, 2]  # channels, height, width: said, since clients take old players' for the last
     return (
