@@ -16,6 +16,7 @@ from fakes import vector_spec
 
 from mappo_unity.cli import player_main
 from mappo_unity.cli.player import run as main
+from mappo_unity.cli.players import options as player_options
 from mappo_unity.cli.players.log import PlayerLog
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol import decode, encode, messages
@@ -485,6 +486,13 @@ class TestCommand:
     def test_arguments_of_unity_players_are_let_through(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("mappo_unity.protocol.serve.serve", lambda player, port, log: port)
         assert main(["3DBall", "-nographics", "-batchmode", "--mlagents-port", "7", "--level", "3"]) == 7
+        assert main(["3DBall", "-headless", "-l", "3", "-log", "x", "-n", "--mlagents-port", "7"]) == 7
+
+    def test_its_own_switches_are_known_in_every_form(self) -> None:
+        for switch in (["-logFile", "here"], ["-logfile=here"]):
+            known, ignored = player_options.parse(["3DBall", "-force-vulkan", *switch, "--param=mass=2"])
+            assert (known.log_file, known.params, ignored) == ("here", {"mass": 2}, ["-force-vulkan"])
+        assert "--help" in player_options.help_text()
 
     def test_a_player_says_that_it_waits_and_what_to_type(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("mappo_unity.protocol.serve.QUIET_S", 0.05)

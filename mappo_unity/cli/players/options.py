@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from mappo_unity.cli.switches import Once, Parser, whole_number
 from mappo_unity.config.ranges import check_range
@@ -22,6 +23,14 @@ examples:
   mappo-player build 3DBall builds                        writes builds/3DBall.x86_64
   mappo-train env=unity env.file_name=builds/3DBall       trains on it
 """
+
+
+class _PlayerParser(Parser):
+    """Know our switches by their whole names alone: -headless is not -h, and -log not -logFile."""
+
+    def _get_option_tuples(self, option_string: str) -> list[Any]:
+        # argparse would complete what begins with a single dash, whatever allow_abbrev says
+        return []
 
 
 def parse(lines: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
@@ -86,7 +95,7 @@ def _check_ignored(parser: Parser, lines: Sequence[str], scene: str, ignored: Se
 
 
 def _parser() -> Parser:
-    parser = Parser(
+    parser = _PlayerParser(
         prog="mappo-player",
         usage="mappo-player SCENE [--mlagents-port N] [options]   |   mappo-player build SCENE DIR [options]",
         description=_DESCRIPTION,
