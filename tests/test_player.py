@@ -216,6 +216,23 @@ class TestWire:
         with pytest.raises(decode.MalformedMessage, match="a picture of .* cannot be decoded"):
             decode._pixels(spoil(png), [])
 
+    @pytest.mark.parametrize("first", [True, False])
+    def test_agents_may_differ_in_what_they_compress(self, first: bool) -> None:
+        from mlagents_envs.communicator_objects.unity_message_pb2 import UnityMessageProto
+        from mlagents_envs.rpc_utils import steps_from_proto
+
+        steps, none = random_steps(2, PICTURE, np.random.default_rng(2)), TerminalSteps.empty(PICTURE)
+        rows = [encode.BehaviorEncoder("B", PICTURE, png).encode(steps, none) for png in (first, not first)]
+        data = messages.message(200, unity_output=encode.output({"B": b"".join(rows)}))
+        infos = messages.parse(data).unity_output.rl_output.agentInfos["B"].value
+        theirs = UnityMessageProto.FromString(data).unity_output.rl_output.agentInfos["B"].value
+
+        kinds = [info.observations[1].compression_type == messages.PNG for info in infos]
+        assert kinds == [first] * 2 + [not first] * 2
+        assert_same_steps(
+            decode.BehaviorDecoder("B", PICTURE).decode(infos)[0], steps_from_proto(theirs, PICTURE)[0]
+        )
+
     def test_a_narrow_picture_is_not_grey(self) -> None:
         shape = (3, 40, 1)
         marks = (DimensionProperty.NONE, *[DimensionProperty.TRANSLATIONAL_EQUIVARIANCE] * 2)

@@ -78,11 +78,21 @@ class BehaviorDecoder:
         return obs, reward, agents, np.array([info.group_id for info in infos], np.int32), group_reward
 
     def _sensor(self, index: int, observations: list[Any], agents: np.ndarray) -> np.ndarray:
-        shape = self.spec.observation_specs[index].shape
-        # a sensor is sent in the same way for all its agents
-        if observations[0].compression_type == PNG:
-            return np.stack([self._picture(index, o) for o in observations])
+        # as ML-Agents, agent by agent: not all cameras of a behavior need be compressed
+        if len(self.spec.observation_specs[index].shape) == 3:
+            packed = [observation.compression_type == PNG for observation in observations]
+            if any(packed):
+                return np.stack(
+                    [
+                        self._picture(index, o) if png else self._numbers(index, [o], agents[i : i + 1])[0]
+                        for i, (o, png) in enumerate(zip(observations, packed, strict=True))
+                    ]
+                )
 
+        return self._numbers(index, observations, agents)
+
+    def _numbers(self, index: int, observations: list[Any], agents: np.ndarray) -> np.ndarray:
+        shape = self.spec.observation_specs[index].shape
         data = [o.float_data.data for o in observations]
         width = self._widths[index]
         if any(len(row) != width for row in data):
