@@ -1,16 +1,24 @@
-"""Players that come back with other behaviors than they left with."""
+"""Players that come back with other behaviors than they left with, or do not come back."""
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from fakes import Record, ScriptedEnv, behavior_spec
 
+from mappo_unity.cli.doctor import diagnose
+from mappo_unity.config.schema import Backend, EnvConfig
+from mappo_unity.envs.backends import make_env_function
+from mappo_unity.errors import ConfigError, EnvironmentFailure
+from mappo_unity.protocol.client import UnityPlayer
 from mappo_unity.protocol.parallel_players import SeveralPlayers
 from mappo_unity.protocol.player_failures import PlayerFailure
+from mappo_unity.protocol.player_options import PlayerOptions
 from mappo_unity.protocol.restarting_player import RestartingPlayer
 
 from mlagents_envs.base_env import ActionTuple  # isort: skip  # mappo_unity lets it import
@@ -96,3 +104,42 @@ def test_a_behavior_that_takes_the_place_of_another_is_seen() -> None:
     env.reset()
     env.step()
     assert list(env.behavior_specs) == [RED, BLUE, GREEN]
+
+
+REASON = r"player Game.x86_64 did not start: \[Errno 86\] Bad CPU type in executable"
+
+
+@pytest.fixture
+def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A player that the system refuses to start."""
+    game = tmp_path / "Game.x86_64"
+    game.write_text("#!/bin/sh\n")
+    game.chmod(0o755)
+
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise OSError(86, "Bad CPU type in executable")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    return game
+
+
+def test_a_first_player_that_the_system_refuses_is_a_mistake_in_the_options(refused: Path) -> None:
+    cfg = EnvConfig(backend=Backend.player, file_name=str(refused), player_logs=str(refused.parent))
+    with pytest.raises(ConfigError, match=f"env.file_name={refused} cannot be started: {REASON}"):
+        make_env_function(cfg)(0)
+
+    lines: list[str] = []
+    assert diagnose(["--file-name", str(refused)], lines.append) == 1
+    assert "did not start: [Errno 86] Bad CPU" in "".join(lines) and "for this system" in "".join(lines)
+
+
+def test_a_player_that_the_system_refuses_to_start_again_uses_restarts_up(
+    refused: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    first: Any = ScriptedPlayer([[Record(0)], GONE])
+    again = PlayerOptions(refused, refused.with_suffix(".log"))
+    env = RestartingPlayer(lambda seed: UnityPlayer(again, seed) if seed else first, 0, max_restarts=2)
+    env.reset()
+    with pytest.raises(EnvironmentFailure, match=f"{REASON}. It was restarted 2 times"):
+        env.step()

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from mappo_unity.config.overrides import shell_word
 from mappo_unity.errors import ConfigError
+from mappo_unity.protocol.player_failures import PlayerFailure
 
 _DIE_WITH_PARENT = """
 import ctypes, os, sys
@@ -140,6 +141,9 @@ class PlayerProcess:
     """A running player, in a session of its own.
 
     `output`: the file for what it prints.
+
+    Raises:
+        PlayerFailure: the system cannot start it, or its output cannot be written.
     """
 
     def __init__(self, executable: Path, arguments: list[str], output: Path) -> None:
@@ -150,8 +154,12 @@ class PlayerProcess:
         if sys.platform.startswith("linux"):
             command = [sys.executable, "-S", "-E", "-c", _DIE_WITH_PARENT, str(os.getpid()), *command]
 
-        output.parent.mkdir(parents=True, exist_ok=True)
-        self._process = _starter(os.getpid()).submit(_start, command, output).result()
+        # Not only a mistake in the options: at a restart the executable may be in the middle of a new build.
+        try:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            self._process = _starter(os.getpid()).submit(_start, command, output).result()
+        except OSError as error:
+            raise PlayerFailure(f"player {executable.name} did not start: {error}") from error
 
     @property
     def pid(self) -> int:

@@ -39,6 +39,9 @@ class RestartingPlayer(BaseEnv):
         max_restarts: restarts allowed over its life; one more failure is an EnvironmentFailure.
         name: for messages.
 
+    Raises:
+        ConfigError: the first player cannot be started.
+
     Attributes: `restarts`, how often a player was started again; `crashed_agents`, for every behavior the ids
     (int32) of the agents whose episodes crashed with the last result, empty nearly always.
     """
@@ -58,14 +61,17 @@ class RestartingPlayer(BaseEnv):
         self._specs = BehaviorMapping({})
         self._statistics: Statistics = {}  # of players that failed
 
-        self.player: UnityPlayer = make_player(seed)
+        try:
+            self.player: UnityPlayer = make_player(seed)
+        except PlayerFailure as error:
+            raise self._mistake(error) from error
 
     def connect(self) -> None:
         """Wait for the first player; raises ConfigError if it does not come (see `UnityPlayer.connect`)."""
         try:
             self.player.connect()
         except PlayerFailure as error:
-            raise ConfigError(f"{self._name} cannot be started: {error}") from error
+            raise self._mistake(error) from error
 
     def send_step(self) -> None:
         """Hand the actions over; `receive` waits for the result."""
@@ -94,7 +100,7 @@ class RestartingPlayer(BaseEnv):
             self.player.receive()
         except PlayerFailure as failure:
             if not self._specs:
-                raise ConfigError(f"{self._name} cannot be started: {failure}") from failure
+                raise self._mistake(failure) from failure
 
             # Before the new player's agents take the places of those that were cut off.
             self._crashed_steps = self._end_crashed_episodes()
@@ -155,6 +161,10 @@ class RestartingPlayer(BaseEnv):
         self.player.close()
 
     # ---- below --------------------------------------------------------------------------------------------
+
+    def _mistake(self, failure: PlayerFailure) -> ConfigError:
+        """Return the error of a first player that never worked."""
+        return ConfigError(f"{self._name} cannot be started: {failure}")
 
     def _took_steps(self) -> None:
         """Remember who plays, and that this went well."""

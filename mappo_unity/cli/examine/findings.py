@@ -14,6 +14,7 @@ CURES = {
     "in use": "another training run or a game started by hand holds it: end that one, or use another port "
     "(env.port=N, here --port N) on both sides",
     FORBIDDEN: "this user may not listen on it: use a port from 1024 up (env.port=N, here --port N)",
+    "not started": "build the game for this system and its processor; does it start by hand?",
     "display": "no display: start players with env.no_graphics=true (no cameras then), or under xvfb-run",
     "no behavior": "the player runs, but no agent requested a decision: give every Agent a DecisionRequester "
     "(or call RequestDecision), set Behavior Type to Default, and see that the agents' objects are active",

@@ -58,8 +58,12 @@ def _examine_running(
         engine={"time_scale": 20.0},
     )
 
+    try:
+        player = UnityPlayer(settings)
+    except PlayerFailure as error:
+        return report.fail(str(error), CURES["not started"])
+
     # in this order: each part needs what the one before it has shown to work
-    player = UnityPlayer(settings)
     try:
         _examine_handshake(report, player)
         if _examine_behaviors(report, player):
