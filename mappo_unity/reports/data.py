@@ -80,8 +80,12 @@ def chart_headings(metrics: Sequence[str], constant: Collection[str] = ()) -> li
     known = [name for name in _FIRST if name in headings]
     others = [name for name in headings if name not in (*_FIRST, _CONSTANT)]
     if _FIRST[0] in headings:
-        headings[_FIRST[0]].sort(key=_EPISODES.index)
-    return [(name, headings[name]) for name in [*known, *others, *([_CONSTANT] if constant else [])]]
+        # a game's own statistics ("Episodes/...") may stand here, too: behind ours
+        ranks = {name: rank for rank, name in enumerate(_EPISODES)}
+        headings[_FIRST[0]].sort(key=lambda name: ranks.get(name, len(ranks)))
+
+    last = [_CONSTANT] if _CONSTANT in headings else []
+    return [(name, headings[name]) for name in [*known, *others, *last]]
 
 
 def as_json(data: Any) -> str:
