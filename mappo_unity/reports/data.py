@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mappo_unity.config.schema import XAxis
-from mappo_unity.reports.curves import COLUMNS, mean_curve, metric_names
+from mappo_unity.reports.curves import COLUMNS, PLACES, Curve, mean_curve, metric_names
 from mappo_unity.reports.groups import Group, run_names
 from mappo_unity.reports.reading import Run
 
@@ -58,7 +58,7 @@ def page_data(runs: Sequence[Run], groups: Sequence[Group]) -> dict[str, Any]:
             for run, name in zip(runs, names)
         ],
         "groups": [
-            {"label": group.label, "curves": _curves(group, metrics) if len(group.runs) > 1 else {}}
+            {"label": group.label, "curves": _curves(group, metrics, every) if len(group.runs) > 1 else {}}
             for group in groups
         ],
     }
@@ -137,15 +137,15 @@ def _number(value: float) -> float | None:
     return int(value) if value.is_integer() and abs(value) < 2**53 else float(f"{value:.7g}")
 
 
-def _curves(group: Group, metrics: Sequence[str]) -> dict[str, dict[str, dict[str, list[float | None]]]]:
+def _curves(
+    group: Group, metrics: Sequence[str], every: int
+) -> dict[str, dict[str, dict[str, list[float | None]]]]:
+    def parts(curve: Curve) -> dict[str, list[float | None]]:
+        # where the runs share no places there are few, chosen for the whole axis
+        step = every if len(curve.x) > PLACES else 1
+        return {part: _numbers(getattr(curve, part), step) for part in ("x", "mean", "spread")}
+
     return {
-        metric: {
-            axis.name: {
-                part: [_number(value) for value in getattr(curve, part).tolist()]
-                for part in ("x", "mean", "spread")
-            }
-            for axis in XAxis
-            for curve in [mean_curve(group.runs, metric, axis)]
-        }
+        metric: {axis.name: parts(mean_curve(group.runs, metric, axis)) for axis in XAxis}
         for metric in metrics
     }
