@@ -134,7 +134,9 @@ class _Handler(BaseHTTPRequestHandler):
         elif self.path == "/":
             from mappo_unity.reports.page import live_page
 
-            self._answer(200, "text/html; charset=utf-8", live_page(self.server.title).encode())
+            # a folder's name need not be UTF-8
+            page = live_page(self.server.title).encode(errors="backslashreplace")
+            self._answer(200, "text/html; charset=utf-8", page)
         elif self.path == "/data.json":
             self._answer(200, "application/json", self.server.answers.newest())
         else:

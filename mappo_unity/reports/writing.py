@@ -46,7 +46,9 @@ def write_report(
     named = top.resolve().name if len(paths) == 1 else f"{len(paths)} folders"
     try:
         findings = diagnosis(runs, run_names(runs)) if diagnosis is not None else []
-        write_atomically(out, report_page(runs, f"{', '.join(env)}: {named}", notes, findings).encode())
+        page = report_page(runs, f"{', '.join(env)}: {named}", notes, findings)
+        # names of files need not be UTF-8
+        write_atomically(out, page.encode(errors="backslashreplace"))
     except OSError as error:
         raise ConfigError(f"out={out} cannot be written ({error.strerror or error})") from error
     return out, len(runs)
