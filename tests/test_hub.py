@@ -7,6 +7,7 @@ import yaml
 
 from mappo_unity.cli import eval_main, hub_main
 from mappo_unity.policies.policy_files import ZOO_FOLDER
+from mappo_unity.sharing.card import Facts, card_text, is_ours
 
 pytest.importorskip("huggingface_hub")
 from fake_hub import TOKEN, FakeHub
@@ -73,6 +74,26 @@ def test_a_readme_of_the_users_own_goes_as_it_is(hub, policies):
     (policies / "README.md").write_text("mine")
     assert hub_main(["push", str(policies), "repo=me/two"]) == 0
     assert hub.repos["me/two"]["README.md"] == b"mine"
+
+
+def test_what_was_pulled_is_pushed_with_the_card_that_came_with_it(hub, policies, tmp_path):
+    (policies / "best.md").write_text(
+        card_text(Facts("Basic", "best.onnx", "Basic", 7, [], 0, "", film="b.mp4"))
+    )
+    (policies / "PushBlock.onnx").unlink()
+    assert hub_main(["push", str(policies), "repo=me/one"]) == 0
+    card = hub.repos["me/one"]["README.md"]
+    assert is_ours(card.decode()) and b"after 7 agent steps" in card and b"[Film](b.mp4)" in card
+
+    out = tmp_path / "pulled"
+    assert hub_main(["pull", "me/one", f"out={out}"]) == 0
+    assert hub_main(["push", str(out), "repo=me/again"]) == 0
+    assert hub.repos["me/again"]["README.md"] == card
+
+    # a card beside its model is newer
+    (out / "Basic.md").write_text("mine")
+    assert hub_main(["push", str(out), "repo=me/again"]) == 0
+    assert hub.repos["me/again"]["README.md"] == b"mine"
 
 
 def test_only_policies_come_and_nothing_is_overwritten(hub, tmp_path, capsys):

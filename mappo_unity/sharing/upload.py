@@ -20,7 +20,8 @@ def upload_of(path: Path) -> dict[str, Path | bytes]:
     """Return what is uploaded of an ONNX file or a folder of them, by its name in the repository.
 
     ONNX files are named after their behaviors, so that a folder of them plays. Their cards become one
-    README.md, unless the folder has one that somebody wrote by hand.
+    README.md, unless the folder has one that somebody wrote by hand, or that knows more than bare files do:
+    that of a pulled folder.
 
     Raises:
         ConfigError: nothing to upload, a file that is no ML-Agents model, or two of one behavior.
@@ -30,7 +31,6 @@ def upload_of(path: Path) -> dict[str, Path | bytes]:
         raise ConfigError(f"nothing to upload: the folder {path} holds no *{SUFFIX}")
 
     files: dict[str, Path] = {}
-    cards = []
     for model in models:
         name = _name(model)
         if name in files:
@@ -39,12 +39,11 @@ def upload_of(path: Path) -> dict[str, Path | bytes]:
                 "its file"
             )
         files[name] = model
-        cards.append(_card(model, name))
 
     films = _films(path, models)
-    own = path / README if path.is_dir() else None
-    if own is not None and own.is_file() and not is_ours(own.read_text(encoding="utf-8", errors="replace")):
-        return {**files, README: own, **films}
+    if path.is_dir() and _goes_as_it_is(path / README, models):
+        return {**files, README: path / README, **films}
+    cards = [_card(model, name) for name, model in files.items()]
     return {**files, README: merged(cards).encode(), **films}
 
 
@@ -53,10 +52,23 @@ def _name(model: Path) -> str:
     return file_name(behavior) if behavior else model.name
 
 
+def _goes_as_it_is(readme: Path, models: Sequence[Path]) -> bool:
+    if not readme.is_file():
+        return False
+    if not any(map(_own_card, models)):
+        return True
+    return not is_ours(readme.read_text(encoding="utf-8", errors="replace"))
+
+
+def _own_card(model: Path) -> Path | None:
+    path = model.with_suffix(CARD)
+    return path if path.is_file() and path.name != README else None
+
+
 def _card(model: Path, name: str) -> str:
     """Return the card beside a file, else one of what the file says of itself; with its name on the hub."""
-    path = model.with_suffix(CARD)
-    if not path.is_file() or path.name == README:
+    path = _own_card(model)
+    if path is None:
         return card_text(replace(facts_of_file(model), file=name))
 
     text = path.read_text(encoding="utf-8", errors="replace")
