@@ -49,7 +49,8 @@ class Handler(BaseHTTPRequestHandler):
         if path.endswith("/batch"):
             return self._batch(json.loads(body))
         if path == "/api/validate-yaml":
-            return self._answer(200, {"errors": [], "warnings": []})
+            errors = [{"message": '"license" must be one of [mit]'}] if b"license: foo" in body else []
+            return self._answer(400 if errors else 200, {"errors": errors, "warnings": []})
 
         repo = "/".join(path.split("/")[3:5])
         if repo not in self.server.repos:

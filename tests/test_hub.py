@@ -142,6 +142,21 @@ def test_mistakes_are_told_in_a_line(hub, tmp_path, capsys, monkeypatch, lines, 
     assert not list(empty.iterdir()) and not hub.commits
 
 
+def test_a_readme_that_the_hub_refuses_is_told(hub, policies, capsys):
+    (policies / "README.md").write_bytes(b"caf\xe9")
+    assert hub_main(["push", str(policies), "repo=me/x"]) == 2
+    assert "README.md is no UTF-8 text (byte 3)" in capsys.readouterr().err and not hub.made
+
+    (policies / "README.md").write_text("---\nlicense: foo\n---\nmine")
+    assert hub_main(["push", str(policies), "repo=me/x"]) == 2
+    error = capsys.readouterr().err
+    assert "the hub refused repo=me/x: Invalid metadata in README.md" in error and error.count("\n") == 1
+    assert '"license" must be one of [mit]' in error and not hub.commits
+
+    (policies / "README.md").write_text("---\nlicense: mit\n---\nmine")
+    assert hub_main(["push", str(policies), "repo=me/x"]) == 0
+
+
 def test_two_files_of_one_behavior_are_not_pushed(hub, policies, capsys):
     shutil.copy(ZOO_FOLDER / "Basic.onnx", policies)
     assert hub_main(["push", str(policies), "repo=me/x"]) == 2

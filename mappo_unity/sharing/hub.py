@@ -78,18 +78,34 @@ def push(files: Mapping[str, Path | bytes], repo: str, private: bool, message: s
         files: by their names in the repository.
 
     Raises:
-        ConfigError: not logged in, no permission, or refused.
+        ConfigError: not logged in, no permission, or refused, as a README.md with wrong front matter is.
         EnvironmentFailure: the hub cannot be reached.
     """
     hub = import_hub()
     check_login()
+    _check_readme(files.get(README))
 
     api = hub.HfApi()
     additions = [hub.CommitOperationAdd(name, content) for name, content in files.items()]
     with _told(hub, repo):
         api.create_repo(repo, private=private, exist_ok=True)
-        done = api.create_commit(repo, additions, commit_message=message)
+        try:
+            done = api.create_commit(repo, additions, commit_message=message)
+        except ValueError as error:  # the client's, of what the hub says of the front matter
+            raise ConfigError(f"the hub refused repo={repo}: {' '.join(str(error).split())}") from error
     return Pushed(str(done.commit_url), list(files))
+
+
+def _check_readme(readme: Path | bytes | None) -> None:
+    """Raise ConfigError if the hub could not read a README.md, before a repository is made for it."""
+    if not isinstance(readme, Path):  # text of ours, or none
+        return
+    try:
+        readme.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"{readme} is no UTF-8 text (byte {error.start}), and the hub takes no other: save it as UTF-8"
+        ) from error
 
 
 def pull(repo: str, out: Path, revision: str | None) -> list[Path]:
