@@ -170,6 +170,10 @@ def test_one_episode_has_no_error_and_undecided_matches_no_share():
     assert "it decided none" in card_text(replace(KNOWN, score=LastWindow(0.0, math.nan, 1.0)))
 
 
+def test_names_break_no_link():
+    assert "[Film](Red%20crew%20%281%29.mp4): the" in card_text(replace(KNOWN, film="Red crew (1).mp4"))
+
+
 def test_names_break_no_table():
     assert "| sees | `a\\|b` | [8] |" in card_text(KNOWN)
 

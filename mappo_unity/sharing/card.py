@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+from urllib.parse import quote
 
 import yaml
 
@@ -90,7 +91,7 @@ def card_text(facts: Facts) -> str:
         MARK,
         f"# {facts.policy}",
         _head(facts),
-        *([f"[Film]({facts.film}): the policy in its scene."] if facts.film else []),
+        *([f"[Film]({quote(facts.film)}): the policy in its scene."] if facts.film else []),
         "## What it sees and does",
         _table(facts),
         "## Score",
