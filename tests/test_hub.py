@@ -1,5 +1,7 @@
 """Pushing to and pulling from the hub: a fake one on loopback, and every message."""
 
+import errno
+import re
 import shutil
 
 import pytest
@@ -181,6 +183,26 @@ def test_a_hub_out_of_reach_ends_with_3(hub, monkeypatch, tmp_path, capsys, line
     monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
     assert hub_main(lines) == 3
     assert "cannot be reached" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied", "/cache/x"), "/cache/x cannot be .*denied"),
+        (OSError(errno.ENOSPC, "No space left on device"), "the hub's cache .*/cache cannot be .*No space"),
+    ],
+)
+def test_a_disk_that_refuses_is_no_network(hub, monkeypatch, tmp_path, capsys, error, words):
+    def refuse(*arguments, **options):
+        raise error
+
+    monkeypatch.setattr("huggingface_hub.HfApi.hf_hub_download", refuse)
+    hub.repos["me/x"] = {"Basic.onnx": b"x"}
+    assert hub_main(["pull", "me/x", f"out={tmp_path}/new"]) == 2
+    assert re.search(words, capsys.readouterr().err)
+
+    error.filename, error.errno = None, errno.ECONNRESET
+    assert hub_main(["pull", "me/x", f"out={tmp_path}/new"]) == 3
 
 
 def test_a_missing_package_names_its_extra(hub, monkeypatch, capsys):

@@ -6,6 +6,7 @@ What the hub's client raises becomes a ConfigError, or an EnvironmentFailure whe
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -27,6 +28,8 @@ _NAME = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?")
 _HTTP_PACKAGES = ("httpx", "httpx2", "httpcore", "httpcore2", "requests")
 """Whose network errors the client lets through; which one it uses has changed with its versions."""
 _UNAUTHORIZED, _FORBIDDEN = 401, 403
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""What a disk refuses; the client's other errors without a file's name are the network's."""
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,9 @@ def _told(hub: Any, repo: str, revision: str | None = None) -> Iterator[None]:
         inner = error.__cause__ if type(error) is RuntimeError and error.__cause__ else error
         if isinstance(inner, errors.HfHubHTTPError):
             raise _refused(repo, inner) from error
+        if isinstance(inner, OSError) and (inner.filename is not None or inner.errno in _DISK):
+            place = inner.filename or f"the hub's cache {hub.constants.HF_HUB_CACHE}"
+            raise ConfigError(f"{place} cannot be read or written: {inner.strerror}") from error
         if type(inner).__module__.partition(".")[0] in _HTTP_PACKAGES or isinstance(inner, OSError):
             raise _unreachable(inner) from error
         raise
