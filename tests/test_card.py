@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from mappo_unity.cli import export_main
+from mappo_unity.cli import export_main, train_main
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import CollectConfig, Config, EnvConfig, LogConfig, ModelConfig, PPOConfig
 from mappo_unity.policies.evaluate import evaluate
@@ -80,6 +80,15 @@ def test_a_checkpoint_without_its_run_has_a_card(run, tmp_path):
     assert export_main([f"run={alone}", "episodes=2"]) == 0
     text = (tmp_path / "mine.md").read_text()
     assert "## Training" not in text and "of 2 episodes" in text
+
+
+def test_agents_that_request_late_are_measured(tmp_path):
+    lines = ["env=custom", "env.name=Late", "env.factory=late_env:make", "model.hidden=[8]", "ppo.epochs=1"]
+    lines += ["collect.rounds=8", "max_steps=32", "log.progress=false", "ppo.minibatch_size=16"]
+    assert train_main([*lines, "export_onnx=false", f"hydra.run.dir={tmp_path / 'run'}"]) == 0
+    assert export_main([f"run={tmp_path / 'run'}", f"out={tmp_path / 'out'}/", "episodes=4"]) == 0
+    text = (tmp_path / "out" / "Probe.md").read_text()
+    assert "of 4 episodes of an agent" in text and "| sees | `vector` | [1] |" in text
 
 
 def test_a_text_of_the_users_own_stays(run, tmp_path, capsys):

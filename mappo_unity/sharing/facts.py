@@ -13,6 +13,7 @@ from mappo_unity import keys
 from mappo_unity.config.compose import load_config
 from mappo_unity.config.schema import Backend, Config, PlayConfig
 from mappo_unity.envs.backends import make_env_function
+from mappo_unity.envs.opening import first_results
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.evaluate import evaluate
 from mappo_unity.policies.first_checks import behaviors_seen
@@ -25,6 +26,7 @@ from mappo_unity.runs.json_record import read_json
 from mappo_unity.runs.metrics_csv import STEP, read_metrics
 from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes import scene_names
+from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS
 from mappo_unity.sharing.card import Earned, Facts, LastWindow, Training, Won
 from mappo_unity.sharing.train_line import train_line
 from mappo_unity.viewing.play import play
@@ -132,7 +134,7 @@ def _specs(trained: Trained, episodes: int | None) -> Mapping[str, Any]:
     base_env = make_env_function(env)(0)
     try:
         base_env.reset()
-        return dict(base_env.behavior_specs)
+        return {name: first.spec for name, first in first_results(base_env, MAX_SILENT_STEPS).items()}
     finally:
         base_env.close()
 
