@@ -79,8 +79,10 @@ class AgentsEnv(ParallelEnv):
 
         Raises:
             ConfigError: more agents of a behavior begin than there are names, or the seed cannot be taken.
+            EnvironmentDataError: a behavior shows that was not there when the environment was opened.
         """
         self.agents, self._seats, self._used = [], {}, set()
+        self._requests = {}  # of an episode that was broken off
         self._seen, self._masks, self._ended_ids = {}, {}, set()
 
         tick = _Tick()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from mlagents_envs.base_env import ActionTuple, BaseEnv, DecisionSteps, TerminalSteps
+from mlagents_envs.base_env import ActionTuple, BaseEnv, BehaviorSpec, DecisionSteps, TerminalSteps
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.parameters.values import params_at
@@ -33,6 +33,7 @@ class Session:
     def __init__(self, env: str | BaseEnv, options: Sequence[str], seed: int, num_areas: int | None) -> None:
         self._make: MakeEnv | None = None
         self._seed = seed
+        self.first: Mapping[str, First] = {}
 
         if isinstance(env, str):
             # as a command line goes: today's names first, then texts as they were typed
@@ -66,6 +67,7 @@ class Session:
 
         Raises:
             ConfigError: a seed is given, but the environment came open and cannot be opened for it.
+            EnvironmentDataError: a behavior has changed, or is new.
         """
         if seed is not None and not (self._is_fresh and seed == self._seed):
             if self._make is None:
@@ -87,7 +89,7 @@ class Session:
             self._env.set_actions(behavior, action)
         self._env.step()
 
-        check_same_specs(self._env.behavior_specs, {name: first.spec for name, first in self.first.items()})
+        check_same_specs(self._env.behavior_specs, self._first_specs())
         return {name: first.check(self._env.get_steps(name)) for name, first in self.first.items()}
 
     def close(self) -> None:
@@ -97,4 +99,13 @@ class Session:
     def _reset(self) -> Mapping[str, First]:
         self._env.reset()
         self._is_fresh = False
-        return first_results(self._env, MAX_SILENT_STEPS)
+        found = first_results(self._env, MAX_SILENT_STEPS)
+
+        known = self._first_specs()
+        if known:
+            # a player that was opened anew shows a behavior only with its first agents
+            check_same_specs({**known, **self._env.behavior_specs}, known)
+        return found
+
+    def _first_specs(self) -> dict[str, BehaviorSpec]:
+        return {name: first.spec for name, first in self.first.items()}

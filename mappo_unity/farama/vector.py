@@ -59,7 +59,7 @@ class AgentsVectorEnv(VectorEnv):
             seed = seed[0]
         super().reset(seed=seed)
 
-        self._rows = {}
+        self._rows, self._requests = {}, {}
         asked = np.zeros(self.num_envs, bool)
         for behavior, first in self._session.begin(seed).items():
             self._take(behavior, first.decision, asked)
