@@ -11,7 +11,8 @@ pytest.importorskip("pettingzoo", reason="needs the package pettingzoo (extra 'f
 from mlagents_envs.base_env import TerminalSteps
 from test_farama import GO, HYBRID, Hybrid
 
-from mappo_unity import parallel_env, vector_env
+from mappo_unity import gym_env, parallel_env, vector_env
+from mappo_unity.errors import ConfigError
 from mappo_unity.farama import session
 from mappo_unity.scenes.contract.rules import EnvironmentDataError
 
@@ -36,6 +37,28 @@ def test_a_behavior_that_shows_after_a_later_reset_is_told(make: Any) -> None:
     env.reset()
     with pytest.raises(EnvironmentDataError, match="behavior 'J' appeared after the start"):
         env.reset()
+
+
+class Alone(Hybrid):
+    """One agent, whose episode is cut off with the first step."""
+
+    def reset(self) -> None:
+        self.t = 0
+        self.result = self.ask([0]), TerminalSteps.empty(HYBRID)
+
+    def step(self) -> None:
+        self.result = self.ask([]), self.end(0, 9, True)
+
+
+def test_a_step_without_an_episode_is_told() -> None:
+    env = gym_env(Alone())
+    with pytest.raises(ConfigError, match="Alone: no episode is running: call reset"):
+        env.step(GO)
+    env.reset()
+    *_, truncated, _ = env.step(GO)
+    assert truncated
+    with pytest.raises(ConfigError, match="Alone: no episode is running: call reset"):
+        env.step(GO)
 
 
 class Reopened(Hybrid):

@@ -35,17 +35,16 @@ class SingleAgentEnv(gymnasium.Env):
         """Begin an episode."""
         super().reset(seed=seed)
         observations, infos = self._agents.reset(seed, options)
-        if len(self._agents.agents) != 1:
-            raise ConfigError(
-                f"{self.metadata['name']}: gym_env plays one agent, but {len(self._agents.agents)} begin: "
-                f"{', '.join(self._agents.agents)}; use parallel_env or vector_env"
-            )
-        (agent,) = self._agents.agents
+        agent = self._agent()
         return observations[agent], {"agent": agent, **infos[agent]}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step until the agent requests a decision or its episode ends."""
-        (agent,) = self._agents.agents
+        """Step until the agent requests a decision or its episode ends.
+
+        Raises:
+            ConfigError: no episode is running, or the action is not in its space.
+        """
+        agent = self._agent()
         observations, rewards, terminated, truncated, infos = self._agents.step({agent: action})
         info = {"agent": agent, **infos[agent]}
         return observations[agent], rewards[agent], terminated[agent], truncated[agent], info
@@ -53,3 +52,15 @@ class SingleAgentEnv(gymnasium.Env):
     def close(self) -> None:
         """Close the environment."""
         self._agents.close()
+
+    def _agent(self) -> str:
+        """Return the name of the agent that plays."""
+        names = self._agents.agents
+        if not names:
+            raise ConfigError(f"{self.metadata['name']}: no episode is running: call reset() before step()")
+        if len(names) > 1:
+            raise ConfigError(
+                f"{self.metadata['name']}: gym_env plays one agent, but {len(names)} begin: "
+                f"{', '.join(names)}; use parallel_env or vector_env"
+            )
+        return names[0]
