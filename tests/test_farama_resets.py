@@ -8,7 +8,8 @@ import pytest
 
 pytest.importorskip("pettingzoo", reason="needs the package pettingzoo (extra 'farama')")
 
-from mlagents_envs.base_env import TerminalSteps
+from fakes import CONTINUOUS_1, Record, ScriptedEnv, vector_spec
+from mlagents_envs.base_env import BehaviorSpec, TerminalSteps
 from test_farama import GO, HYBRID, Hybrid
 
 from mappo_unity import gym_env, parallel_env, vector_env
@@ -37,6 +38,34 @@ def test_a_behavior_that_shows_after_a_later_reset_is_told(make: Any) -> None:
     env.reset()
     with pytest.raises(EnvironmentDataError, match="behavior 'J' appeared after the start"):
         env.reset()
+
+
+def spec_of(*names: str) -> BehaviorSpec:
+    return BehaviorSpec([vector_spec(1, name) for name in names], CONTINUOUS_1)
+
+
+@pytest.mark.parametrize(
+    ("sides", "fit"),
+    [
+        ((["blue"], ["red"]), True),  # one sensor is a Box, whatever its name
+        ((["a", "b"], ["a", "b"]), True),
+        ((["a", "b"], ["b", "a"]), False),
+        ((["a", "b"], ["a", "c"]), False),
+    ],
+)
+def test_sides_with_equal_spaces_are_one_vector(sides: tuple[list[str], list[str]], fit: bool) -> None:
+    specs = {f"T?team={side}": spec_of(*names) for side, names in enumerate(sides)}
+    first = [Record(side, behavior=name) for side, name in enumerate(specs)]
+    env = ScriptedEnv([first, first], specs)
+    if not fit:
+        with pytest.raises(ConfigError, match="have different spaces; use parallel_env"):
+            vector_env(env)
+        return
+
+    rows = vector_env(env)
+    seen, _ = rows.reset()
+    assert rows.num_envs == 2 and rows.observation_space.contains(seen)
+    rows.step(rows.action_space.sample())
 
 
 class Alone(Hybrid):

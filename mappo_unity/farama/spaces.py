@@ -31,6 +31,12 @@ class BehaviorSpaces:
         self.observation = boxes[0] if len(boxes) == 1 else spaces.Dict(dict(zip(self.keys, boxes)))
         self.action = _action_space(self._actions.continuous_size, self._actions.discrete_branches)
 
+    def is_like(self, other: BehaviorSpaces) -> bool:
+        """Return whether another behavior has equal spaces, its sensors in the same order."""
+        if len(self.keys) > 1 and self.keys != other.keys:
+            return False
+        return self.observation == other.observation and self.action == other.action
+
     def observe(self, steps: DecisionSteps | TerminalSteps, rows: Any) -> Any:
         """Return the observations of a row, or of rows, as the space (batched for rows); copies."""
         arrays = [np.array(sensor[rows], np.float32) for sensor in steps.obs]

@@ -31,23 +31,23 @@ class AgentsVectorEnv(VectorEnv):
 
     def __init__(self, session: Session, add_group_rewards: bool) -> None:
         self._session, self._adds = session, add_group_rewards
-        specs = [first.spec for first in session.first.values()]
-        if any(spec != specs[0] for spec in specs):
+        self._spaces = {name: BehaviorSpaces(name, first.spec) for name, first in session.first.items()}
+        own = next(iter(self._spaces.values()))
+        if not all(own.is_like(other) for other in self._spaces.values()):
             session.close()
             raise ConfigError(
                 f"{session.name}: its behaviors {', '.join(session.first)} have different spaces; use "
                 "parallel_env"
             )
 
-        self._spaces = {name: BehaviorSpaces(name, first.spec) for name, first in session.first.items()}
-        self._branches = list(specs[0].action_spec.discrete_branches)
-        own = next(iter(self._spaces.values()))
+        spec = next(iter(session.first.values())).spec
+        self._branches = list(spec.action_spec.discrete_branches)
         self.num_envs = sum(len(first.decision) for first in session.first.values())
         self.single_observation_space, self.single_action_space = own.observation, own.action
         self.observation_space = batch_space(own.observation, self.num_envs)
         self.action_space = batch_space(own.action, self.num_envs)
 
-        shapes = [tuple(sensor.shape) for sensor in specs[0].observation_specs]
+        shapes = [tuple(sensor.shape) for sensor in spec.observation_specs]
         self._obs = [np.zeros((self.num_envs, *shape), np.float32) for shape in shapes]
         self._masks = [np.ones((self.num_envs, size), np.int8) for size in self._branches]
         self._rows: dict[int, int] = {}  # of agents, by id
