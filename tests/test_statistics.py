@@ -12,12 +12,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import reporting_env
 
 from mappo_unity.cli import train_main
 from mappo_unity.cli.player import run as player_main
 from mappo_unity.config.schema import Backend, EnvConfig
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.envs.statistics import with_statistics
+from mappo_unity.farama import session as farama
+from mappo_unity.policies.episodes import play
+from mappo_unity.policies.policy import RandomPolicy
 from mappo_unity.protocol import side_channels
 from mappo_unity.protocol.side_channels import TrainerChannels, statistics_messages
 from mappo_unity.scenes.contract.statistics import AGGREGATIONS, join_statistics
@@ -93,6 +97,21 @@ def test_what_players_report_reaches_the_metrics_of_a_run(player: str, tmp_path:
     lines = [*SMALL[3:], "env=unity", "env.name=P", f"env.file_name={player}", "log.loggers=[csv]"]
     assert train_main([*lines, f"output_dir={tmp_path / 'runs'}"]) == 0
     assert [float(row["Game/sum"]) for row in read_rows(tmp_path / "runs")] == [10, 26]
+
+
+def test_nothing_piles_up_where_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = reporting_env.make(0)
+    play(env, RandomPolicy(0), episodes=20)
+    assert env.steps >= 5 and env.reported == {}
+
+    monkeypatch.setattr(farama, "make_env_function", lambda cfg: reporting_env.make)
+    session = farama.Session("3DBall", [], seed=0, num_areas=1)
+    session.step({})
+    assert session._env.steps == 1 and session._env.reported == {}
+
+    # of an environment that came open somebody else may read them
+    farama.Session(env, [], seed=0, num_areas=1).step({})
+    assert len(env.reported["Game/sum"]) == 1
 
 
 def test_the_bytes_are_those_of_mlagents() -> None:

@@ -15,6 +15,7 @@ from mappo_unity.envs.backends import MakeEnv, make_env_function
 from mappo_unity.envs.opening import First, first_results
 from mappo_unity.errors import ConfigError
 from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_same_specs
+from mappo_unity.scenes.contract.statistics import pop_statistics
 
 
 class Session:
@@ -88,6 +89,8 @@ class Session:
         for behavior, action in actions.items():
             self._env.set_actions(behavior, action)
         self._env.step()
+        if self._make is not None:  # nobody else can read them here, and a player's would pile up
+            pop_statistics(self._env)
 
         check_same_specs(self._env.behavior_specs, self._first_specs())
         return {name: first.check(self._env.get_steps(name)) for name, first in self.first.items()}

@@ -13,6 +13,7 @@ from mappo_unity.errors import EnvironmentFailure
 from mappo_unity.policies.policy import Policy
 from mappo_unity.scenes.contract.records import RecordCheck
 from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_silence, check_specs
+from mappo_unity.scenes.contract.statistics import pop_statistics
 
 MAX_ENV_STEPS = 5_000_000
 NUM_BATCHES = 40  # of consecutive episodes, at most
@@ -62,6 +63,7 @@ def play(
             return counts.ended
         check_silence(silent, MAX_SILENT_STEPS)
         env.step()
+        pop_statistics(env)  # which nobody reads here: a player's would pile up
 
     raise _endless(env, episodes, counts)
 
