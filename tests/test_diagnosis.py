@@ -9,10 +9,13 @@ from typing import Any
 import faulty_env
 import numpy as np
 import pytest
+import torch
 from doctor_score import lines_of
 from fakes import vector_spec
 from mlagents_envs.base_env import ActionSpec, BehaviorSpec
+from tensordict import TensorDict
 
+from mappo_unity import keys
 from mappo_unity.cli import doctor_main, report_main, train_main
 from mappo_unity.diagnosis.diagnose import diagnose
 from mappo_unity.diagnosis.evidence import Evidence
@@ -278,6 +281,7 @@ def test_what_the_environment_sends() -> None:
     assert found({"elements": wide}, {"model.normalize_obs": "false"}) == ["huge"]
     assert found({"elements": wide}, {"behaviors.Probe.model.normalize_obs": "false"}) == ["huge"]
     assert found({"images": {"obs_1": {"least": 7.0, "greatest": 7.0}}}) == ["constant"]
+    assert found({"sets": {"obs_1": {"least": 1.0, "greatest": 1.0}}}) == [], "entities that are all alike"
     assert found({"never_allowed": [2]}) == ["never allowed"]
     assert found({"slots": {"all": 32, "idle": 4}}) == ["idle agents"]
     assert found({"slots": {"all": 32, "idle": 3}}) == [], "some of a team may be dead for long"
@@ -292,6 +296,26 @@ def test_what_the_environment_sends() -> None:
     ends = {"elements": FACTS["elements"] | {"clipped": [1], "clipped_share": 0.5}}
     assert found(ends) == ["clipped"]
     assert found(ends | {"vectors": [["RayPerceptionSensor", 2]]}) == [], "a ray that meets nothing"
+
+
+@pytest.mark.parametrize("others", [[], ["obs_1"], ["obs_2"], ["obs_1", "obs_2"]])
+def test_whoever_has_a_camera_or_entities_does_not_see_the_same(others: list[str]) -> None:
+    sensors = {"obs_1": torch.ones(3, 1, 2, 3, 4, 4), "obs_2": torch.zeros(3, 1, 2, 5, 2)}
+    time = torch.arange(3.0).reshape(3, 1, 1, 1).expand(3, 1, 2, 1)
+    seen = {keys.OBS: time, keys.ACTING: torch.ones(3, 1, 2, 1, dtype=torch.bool)}
+    survey = PolicySurvey(BehaviorSpec([vector_spec(1)], ActionSpec.create_discrete((2,))))
+    survey.look(TensorDict(seen | {name: sensors[name] for name in others}, [3, 1, 2]))
+
+    facts = survey.facts
+    assert facts["same_for_all"] == (None if others else True)
+    assert list(facts["images"]) == [name for name in others if name == "obs_1"]
+    assert list(facts["sets"]) == [name for name in others if name == "obs_2"]
+    wanted = {
+        "obs_1": "Probe: the images of obs_1 never change",
+        "obs_2": "Probe: obs_2 never holds an entity",
+    }
+    evidence = Evidence(run_of(), {"Probe": FACTS | {kind: facts[kind] for kind in ("images", "sets")}})
+    assert [finding.text for finding in diagnose(evidence)] == [wanted[name] for name in others]
 
 
 def test_a_spec_of_numpy_numbers_is_surveyed(tmp_path: Path) -> None:

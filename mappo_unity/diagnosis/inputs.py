@@ -51,6 +51,14 @@ def _observations(evidence: Evidence, name: str, facts: Facts) -> Iterator[Findi
                 f"every pixel was {amount(image['least'])} {seen}",
                 "is the camera active, and are graphics on (env.no_graphics=false)?",
             )
+    for sensor, entities in facts.get("sets", {}).items():  # surveys of older versions have none
+        if entities["least"] == entities["greatest"] == 0:
+            yield Finding(
+                "constant",
+                f"{name}: {sensor} never holds an entity",
+                f"it was empty {seen}",
+                "is it filled in (AppendObservation of its BufferSensorComponent, in CollectObservations)?",
+            )
     if elements is None:
         return
 

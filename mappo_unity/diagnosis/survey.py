@@ -58,6 +58,7 @@ class PolicySurvey:
             "opposed": False,  # whether an opponent has ever played its agents
             "elements": None,
             "images": {},
+            "sets": {},
             "same_for_all": None,
             "one_action": None,
             "never_allowed": None,
@@ -133,11 +134,14 @@ class PolicySurvey:
             return entry.reshape(-1, *entry.shape[asked.dim() :])[places].cpu()
 
         names = set(rounds.keys())
+        others = sorted(n for n in names if n.startswith(keys.SENSOR.format("")))  # images and sets
         if keys.OBS in names:
             self._look_at_elements(rows(keys.OBS).float().numpy())
-            self._compare_agents(rounds.get(keys.OBS), asked)
-        for name in sorted(n for n in names if n.startswith(keys.SENSOR.format(""))):
-            self._look_at_image(name, rows(name))
+            if not others:  # an agent's own camera tells it where it is, though its vectors do not
+                self._compare_agents(rounds.get(keys.OBS), asked)
+        for name in others:
+            values = rows(name)
+            self._look_at_range("sets" if values.dim() == 3 else "images", name, values)
         if keys.MASK in names:
             self._look_at_masks(rows(keys.MASK).numpy())
 
@@ -168,12 +172,12 @@ class PolicySurvey:
         is_alike = bool((rounds == rounds[:, :1]).all()) and bool((rounds != rounds[:1]).any())
         self.facts["same_for_all"] = is_alike and self.facts["same_for_all"] is not False
 
-    def _look_at_image(self, name: str, pixels: torch.Tensor) -> None:
-        seen = self.facts["images"].get(name)
-        least, greatest = float(pixels.min()), float(pixels.max())
+    def _look_at_range(self, kind: str, name: str, values: torch.Tensor) -> None:
+        seen = self.facts[kind].get(name)
+        least, greatest = float(values.min()), float(values.max())
         if seen is not None:
             least, greatest = min(least, seen["least"]), max(greatest, seen["greatest"])
-        self.facts["images"][name] = {"least": least, "greatest": greatest}
+        self.facts[kind][name] = {"least": least, "greatest": greatest}
 
     def _look_at_masks(self, allowed: np.ndarray) -> None:
         starts = np.cumsum([0, *self._branches[:-1]])
