@@ -199,6 +199,16 @@ def test_slow_protobuf_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert code == 1 and CURES["protobuf"] in text
 
 
+def test_a_missing_protobuf_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "google.protobuf.internal", None)
+    code, text = examine()
+    assert code == 1 and "FAIL  protobuf cannot be imported (" in text and "ports and display" in text
+
+    monkeypatch.setitem(sys.modules, "mappo_unity.protocol.client", None)
+    code, text = examine("--editor")
+    assert code == 1 and "FAIL  no player can be examined (" in text and "2 failed" in text
+
+
 def test_mistakes_in_the_options(capsys: Any) -> None:
     assert doctor_main(["--fil-name", "Game"]) == 2
     assert doctor_main(["--file-name", "Game", "--editor"]) == 2

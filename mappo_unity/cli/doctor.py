@@ -62,7 +62,10 @@ def diagnose(arguments: Sequence[str], say: Say) -> int:
         from mappo_unity.cli.examine.player import examine_player
 
         report.head("Editor" if options.editor else "player")
-        examine_player(report, options)
+        try:
+            examine_player(report, options)
+        except ModuleNotFoundError as error:  # a package, as was told above
+            report.fail(f"no player can be examined ({error})", "install what is missing first")
 
     report.head(f"{report.failures} failed, {report.warnings} to look at")
     return 1 if report.failures else 0
@@ -90,18 +93,25 @@ def examine_packages(report: Report) -> None:
                 f"{name} is not installed", "pip install mappo-unity, which brings what goes together"
             )
 
-    from google.protobuf.internal import api_implementation
+    _examine_protobuf(report)
+    try:
+        check_mujoco()
+    except ConfigError as error:
+        report.mistake(error)
+
+
+def _examine_protobuf(report: Report) -> None:
+    try:
+        from google.protobuf.internal import api_implementation
+    except ImportError as error:  # missing, or installed in part
+        report.fail(f"protobuf cannot be imported ({error})", "pip install --force-reinstall protobuf")
+        return
 
     kind = api_implementation.Type()
     if kind == "python":
         report.fail("protobuf runs in pure Python", CURES["protobuf"])
     else:
         report.good(f"protobuf is compiled ({kind})")
-
-    try:
-        check_mujoco()
-    except ConfigError as error:
-        report.mistake(error)
 
 
 def examine_ports(report: Report, editor_port: int) -> None:
