@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import zipfile
 from collections.abc import Callable
@@ -457,12 +458,14 @@ class TestEditor:
         finally:
             play.kill()
 
-    def test_an_editor_that_never_comes(self) -> None:
+    def test_an_editor_that_never_comes(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
         port = free_port()
         with pytest.raises(
             ConfigError, match=f"did not connect to port {port} within env.timeout_s=0.5: press"
         ):
             make_env_function(EnvConfig(backend=Backend.editor, port=port, timeout_s=0.5))(0)
+        assert not list(tmp_path.iterdir()), "its log is its own, and needs no folder"
 
     def test_a_port_in_use(self, capfd: pytest.CaptureFixture[str]) -> None:
         with socket.socket() as holder:

@@ -90,7 +90,8 @@ def _players(cfg: EnvConfig, log_folder: Path | None) -> MakeEnv:
     executable, own_args = find_player(cfg)
     # in ML-Agents' order: an entry's arguments come behind those of the command line
     arguments = [*cfg.player_args, *own_args]
-    folder = _log_folder(cfg, log_folder)
+    # the Editor's log is its own, and lies where Unity writes it
+    folder = Path() if cfg.backend is Backend.editor else _log_folder(cfg, log_folder)
 
     def start(number: int, seed: int) -> RestartingPlayer:
         name = f"player {number}" if cfg.num_players > 1 else _describe(cfg)
