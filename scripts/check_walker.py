@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
-"""Show what figures of Walker earn and where they fall: by the goal's speed, by their turn at the start, and by
-how long the target has been where it is.
+"""Show what figures of Walker earn and where they fall: by the goal's speed, by their turn at the start, and
+by how long the target has been where it is.
 
     scripts/check_walker.py --policy RUN [--episodes 8] [--num-areas 64] [--deterministic] [--seed 0]
 
@@ -24,7 +24,7 @@ from mappo_unity.scenes.walker.scene import MAX_SPEED, Walker, forward
 
 SPEED_STEP = 1.0  # m/s
 TURN_STEP = 45.0  # degrees
-MOVED_STEP, MOVED_MOST = 0.5, 4.0  # seconds since the target was elsewhere; longer ones count with the longest
+MOVED_STEP, MOVED_MOST = 0.5, 4.0  # seconds since the target was elsewhere, and the most told apart
 TICKS_A_DECISION = Walker.DECISION_PERIOD
 
 
