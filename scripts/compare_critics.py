@@ -112,8 +112,8 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
     metrics, last = read_metrics(folder / "metrics.csv"), last_lessons(folder)
     end = next((place for place, row in enumerate(metrics) if row["agent_steps"] >= steps), len(metrics))
     shown = with_value(settled(metrics[: end + 1], last), "group_return_mean")
-    for row in thin(shown, POINTS):
-        point = {
+    points = [
+        {
             "date": time.strftime("%Y-%m-%d"),
             "scene": scene,
             "critic": critic,
@@ -125,8 +125,13 @@ def learn(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> 
             "lessons": 1 + sum(last.values()),
             "load": f"{load:.1f}-{os.getloadavg()[0]:.1f}",
         }
-        append(CURVES, point)
-    print(" ".join(f"{name}={value}" for name, value in point.items()), flush=True)
+        for row in thin(shown, POINTS)
+    ]
+    append(CURVES, *points)
+    if points:
+        print(" ".join(f"{name}={value}" for name, value in points[-1].items()), flush=True)
+    else:
+        print(f"{folder}: no curve, since it ended before its first 100 episodes had", flush=True)
 
 
 def play(arguments: argparse.Namespace, scene: str, critic: str, seed: int) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import json
 import math
 import os
@@ -121,14 +122,21 @@ def thin(
     return [points[place] for place in sorted(places)]
 
 
-def append(path: Path, row: dict[str, object]) -> None:
-    """Append a row to a CSV file, which gets a head if it is new."""
-    is_new = not path.exists()
-    with open(path, "a", newline="") as file:
-        writer = csv.DictWriter(file, list(row))
-        if is_new:
-            writer.writeheader()
-        writer.writerow(row)
+def append(path: Path, *rows: dict[str, Any]) -> None:
+    """Append rows to a CSV file, which gets a head if it is new.
+
+    All at once: a curve of which a part stands there is not written again.
+    """
+    if not rows:
+        return
+
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(rows[0]))
+    if not path.exists():
+        writer.writeheader()
+    writer.writerows(rows)
+    with open(path, "ab", buffering=0) as file:
+        file.write(text.getvalue().encode())
 
 
 if __name__ == "__main__":

@@ -127,9 +127,12 @@ def race(arguments: argparse.Namespace, scene: str, seed: int, who: str, limit_s
     # whoever is interrupted plays on while it saves
     points = [point for point in points if point[0] <= limit_s]
     target = TARGETS.get(scene, math.inf)
-    for at_s, decisions, value in thin(points, POINTS, lambda point: point[2] >= target):
-        row = {"scene": scene, "who": who, "seed": seed, "second": round(at_s, 1), "decisions": decisions}
-        append(RACE, row | {"return": f"{value:.4g}"} | facts)
+    place = {"scene": scene, "who": who, "seed": seed}
+    rows = [
+        place | {"second": round(at_s, 1), "decisions": decisions, "return": f"{value:.4g}"} | facts
+        for at_s, decisions, value in thin(points, POINTS, lambda point: point[2] >= target)
+    ]
+    append(RACE, *rows)
     print(scene, who, seed, facts, points[-1:], flush=True)
 
 

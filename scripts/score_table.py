@@ -229,8 +229,8 @@ def append_curve(measure: Measure, seed: int, metrics: list[dict[str, int | floa
         return
 
     points = with_value(metrics, measure.column)
-    for row in thin(points, POINTS, lambda point: measure.is_reached(point[measure.column])):
-        point = {
+    rows = [
+        {
             "scene": measure.scene,
             "column": measure.column,
             "seed": seed,
@@ -238,7 +238,9 @@ def append_curve(measure: Measure, seed: int, metrics: list[dict[str, int | floa
             "minutes": f"{row['wall_s'] / 60:.2f}",
             "value": f"{row[measure.column]:.4g}",
         }
-        append(CURVES, point)
+        for row in thin(points, POINTS, lambda point: measure.is_reached(point[measure.column]))
+    ]
+    append(CURVES, *rows)
 
 
 if __name__ == "__main__":

@@ -84,6 +84,28 @@ def test_a_row_has_the_seeds_of_a_critic(tmp_path: Path, monkeypatch: pytest.Mon
     assert lines[-5:-2] == rows
 
 
+def test_a_run_that_ends_before_a_hundred_episodes_has_no_curve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "DungeonEscape-local-0"
+    folder.mkdir()
+    write_record(folder, compose_config(["env=DungeonEscape"]).config, [])
+    header = "agent_steps,wall_s,episodes,group_return_mean\n"
+    (folder / "metrics.csv").write_text(f"{header}10,1,40,0.1\n20,2,99,0.2\n")
+    monkeypatch.setattr(compare_critics, "CURVES", tmp_path / "critics.csv")
+    monkeypatch.setattr(compare_critics, "train", lambda *given: None)
+    arguments = argparse.Namespace(out=tmp_path, steps=20, minutes=1.0)
+
+    compare_critics.learn(arguments, "DungeonEscape", "local", 0)
+    assert not compare_critics.CURVES.exists()
+    assert f"{folder}: no curve" in capsys.readouterr().out
+
+    (folder / "metrics.csv").write_text(f"{header}10,1,40,0.1\n20,2,100,0.2\n")
+    compare_critics.learn(arguments, "DungeonEscape", "local", 0)
+    [point] = compare_critics.read_curves()["DungeonEscape"]["local"]["0"]
+    assert (point.decisions, point.value) == (20, 0.2)
+
+
 def test_the_checkpoint_at_the_runs_end_is_played_in_the_last_lesson(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
