@@ -23,9 +23,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import yaml
 from run_script import run_script
 
+from mappo_unity.errors import ConfigError
 from mappo_unity.runs.checkpoint_file import checkpoints_in
+from mappo_unity.runs.folder import OVERRIDES
 from mappo_unity.runs.metrics_csv import read_metrics
 
 Point = TypeVar("Point")
@@ -56,11 +59,42 @@ def main() -> None:
 
 def train(scene: str, seed: int, folder: Path, options: list[str]) -> None:
     """Train a seed, or resume it where a run folder stands already."""
-    if (folder / "checkpoints").is_dir():
-        lines = [f"resume={folder}"]
-    else:
-        lines = [f"env={scene}", f"seed={seed}", f"hydra.run.dir={folder}", *options]
+    lines = begin_or_resume(scene, seed, folder, options)
     subprocess.run([HERE / "mappo-train", *lines], check=True)
+
+
+def begin_or_resume(scene: str, seed: int, folder: Path, options: list[str]) -> list[str]:
+    """Return the options with which mappo-train begins a run, or resumes it where it has checkpoints.
+
+    A resumed run keeps its options, and would be noted with these: raises ConfigError if it was begun with
+    others.
+    """
+    asked = [f"env={scene}", f"seed={seed}", f"hydra.run.dir={folder}", *options]
+    if not (folder / "checkpoints").is_dir():
+        return asked
+
+    begun = begun_with(folder)
+    if begun is not None and set(without_place(begun)) != set(without_place(asked)):
+        here, there = (" ".join(without_place(lines)) for lines in (asked, begun))
+        raise ConfigError(
+            f"{folder} was begun with {there}, which a resumed run keeps, and not with {here}: give the same "
+            "options or another --out"
+        )
+    return [f"resume={folder}"]
+
+
+def begun_with(folder: Path) -> list[str] | None:
+    """Return the options with which a run was begun; None: its record does not say."""
+    path = folder / OVERRIDES
+    entries = yaml.safe_load(path.read_text()) if path.is_file() else []
+    calls: list[list[str]] = [entry["overrides"] for entry in entries]
+    begins = [lines for lines in calls if not any(line.startswith("resume=") for line in lines)]
+    return begins[-1] if begins else None
+
+
+def without_place(lines: list[str]) -> list[str]:
+    """Return options without those that say where a run lies."""
+    return [line for line in lines if not line.startswith("hydra.")]
 
 
 def evaluate(scene: str, seed: int, folder: Path, episodes: int) -> list[dict[str, object]]:

@@ -9,7 +9,8 @@ own policies (ONNX files named after their behaviors, in one folder) and random 
     python scripts/score_table.py Hallway Basic [--seeds 0 1 2] [--minutes 120] [--unity FOLDER] [OPTION ...]
     python scripts/score_table.py --draw                      # only scores.md and the pictures
 
-OPTIONs of mappo-train are noted with the run. The pictures need matplotlib.
+OPTIONs of mappo-train are noted with the run, which is resumed with the same ones only. The pictures need
+matplotlib.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from decisions_to import read_last_lesson, with_value
-from learn_scene import HERE, append, mappo_eval, read_rows, thin
+from learn_scene import HERE, append, begin_or_resume, mappo_eval, read_rows, thin
 from run_script import check_names, run_script
 from score_measures import MEASURES, Measure, measures_of
 from score_page import CURVES, FIXED, SCORES, write_page
@@ -95,6 +96,7 @@ def measure_seed(arguments: argparse.Namespace, scene: str, seed: int, options: 
     if is_there and not (missing(arguments, scene, str(seed)) and (folder / "checkpoints").is_dir()):
         return
 
+    begin_or_resume(scene, seed, folder, options)  # what the rows note is what it was trained with
     load = os.getloadavg()[0]
     if not is_there:
         train(scene, seed, folder, arguments.minutes, options)
@@ -124,9 +126,8 @@ def last_lesson(folder: Path) -> list[str]:
 def train(scene: str, seed: int, folder: Path, minutes: float, options: list[str]) -> None:
     """Train until the run ends or has spent its minutes; a run that stands is resumed."""
     spent_s = 0.0
-    lines = [f"env={scene}", f"seed={seed}", f"hydra.run.dir={folder}", *options]
+    lines = begin_or_resume(scene, seed, folder, options)
     if (folder / "checkpoints").is_dir():
-        lines = [f"resume={folder}"]
         spent_s = read_metrics(folder / "metrics.csv")[-1]["wall_s"]
     left_s = minutes * 60 - spent_s
     if left_s <= 0:
