@@ -31,7 +31,7 @@ from typing import Any
 
 from learn_scene import append, results
 from peer_command import add_peer_options, check_peer_options, their_command
-from recorded_player import ROOT, make_player
+from recorded_player import EPISODES, ROOT, make_player, noted
 from run_script import run_script
 
 TRAINERS = "mlagents-learn", "mappo-unity"
@@ -114,8 +114,7 @@ def our_command(scene: str, seed: int, steps: int, player: Path, folder: Path) -
 
 def episodes(folder: Path) -> list[tuple[int, float]]:
     """Return the decisions at which each episode of a run ended, and its return."""
-    with open(folder / "episodes.csv") as file:
-        return [(int(at), float(own) + float(group)) for at, own, group, *_ in csv.reader(file)]
+    return [(at, value) for at, value, _ in noted(folder / EPISODES)]
 
 
 def last_return(folder: Path, limit: int) -> float:

@@ -20,7 +20,6 @@ What was measured stands in docs/benchmarks/race.csv and race_matches.csv, and i
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import os
 import shutil
@@ -34,7 +33,7 @@ from typing import Any
 from learn_scene import HERE, append, mappo_eval, read_rows, thin
 from peer_command import add_peer_options, check_peer_options, their_command
 from race_page import EMBEDDED, MATCHES, NAMES, PEER, PLAYER, RACE, TARGETS, WINDOW, write_page
-from recorded_player import make_player
+from recorded_player import EPISODES, make_player, noted
 from run_script import run_script
 from score_measures import share_won
 
@@ -42,6 +41,7 @@ from mappo_unity.runs.metrics_csv import read_metrics
 
 POINTS = 60  # of a curve
 COMPETITIVE = ("SoccerTwos",)
+NOT_RACED = ("StrikersVsGoalie",)  # no return tells who plays well, and each side is a file of its own
 NUM_MATCHES = 400
 DONE = "trained"  # the file that says so, in a folder whose matches are not all in the table
 
@@ -82,6 +82,11 @@ def minutes_of(word: str) -> tuple[str, float]:
     number = _number(minutes)
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{word} must be SCENE=MINUTES, such as 3DBall=3")
+    if scene in NOT_RACED:
+        raise argparse.ArgumentTypeError(
+            f"{scene} cannot be raced: no return tells who plays well, and each of its sides has a policy of "
+            f"its own; of the scenes with two sides {', '.join(COMPETITIVE)} can be"
+        )
     return scene, number
 
 
@@ -196,8 +201,7 @@ def decisions_of(folder: Path) -> int:
     path = folder / "run/metrics.csv"
     if path.exists():
         return int(read_metrics(path)[-1]["agent_steps"])
-    with open(folder / "episodes.csv") as file:
-        return int(list(csv.reader(file))[-1][0])
+    return noted(folder / EPISODES)[-1][0]
 
 
 def command_of(arguments: argparse.Namespace, scene: str, seed: int, who: str, folder: Path) -> list[Any]:
@@ -261,12 +265,12 @@ def heed_interrupts() -> None:
 
 def player_curve(folder: Path, start: float) -> list[tuple[float, int, float]]:
     """Return (seconds, decisions, mean return of the newest episodes) from what the player noted."""
-    with open(folder / "episodes.csv") as file:
-        rows = [(float(at), int(n), float(own) + float(group)) for n, own, group, at in csv.reader(file)]
+    episodes = noted(folder / EPISODES)
     points = []
-    for i in range(WINDOW - 1, len(rows), WINDOW // 4):
-        mean = statistics.mean(value for _, _, value in rows[i - WINDOW + 1 : i + 1])
-        points.append((rows[i][0] - start, rows[i][1], mean))
+    for i in range(WINDOW - 1, len(episodes), WINDOW // 4):
+        mean = statistics.mean(value for _, value, _ in episodes[i - WINDOW + 1 : i + 1])
+        decisions, _, at_s = episodes[i]
+        points.append((at_s - start, decisions, mean))
     return points
 
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import csv
+import itertools
+import math
 import os
 import shlex
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 ROOT = Path(__file__).resolve().parents[1]
+EPISODES = "episodes.csv"
 
 
 def make_player(scene: str, folder: Path) -> Path:
@@ -19,7 +25,7 @@ def make_player(scene: str, folder: Path) -> Path:
         "env",
         f"PYTHONPATH={os.pathsep.join([str(ROOT / 'scripts'), str(ROOT)])}",
         f"PEER_SCENE={scene}",
-        f"PEER_EPISODES={folder / 'episodes.csv'}",
+        f"PEER_EPISODES={folder / EPISODES}",
         *[sys.executable, "-m", "mappo_unity.player", "recorded_player:recorded_scene"],
     ]
     path.write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n')
@@ -37,13 +43,34 @@ def recorded_scene(seed: int = 0) -> Any:
     return env
 
 
+def places(path: Path) -> Iterator[Path]:
+    """Yield where the players of a run note their episodes: the path, and those with _1, _2 ... behind it."""
+    yield path
+    yield from (path.with_stem(f"{path.stem}_{count}") for count in itertools.count(1))
+
+
+def noted(path: Path) -> list[tuple[int, float, float]]:
+    """Return decisions so far, return and second (Unix) of every episode that a run's players noted.
+
+    A player that was started again counts on from the last episode of the one before it.
+    """
+    episodes: list[tuple[int, float, float]] = []
+    for place in itertools.takewhile(Path.exists, places(path)):
+        before = episodes[-1][0] if episodes else 0
+        with open(place, newline="") as file:
+            for decisions, own, group, *at_s in csv.reader(file):  # older files have no seconds
+                value, second = float(own) + float(group), float(at_s[0]) if at_s else math.nan
+                episodes.append((before + int(decisions), value, second))
+    return episodes
+
+
 class Episodes:
     """Write a line for each episode of a BaseEnv: decisions so far, own and group return, seconds (Unix)."""
 
     def __init__(self, env: Any, path: Path) -> None:
         self._env, self._step, self._reset = env, env.step, env.reset
         self._decisions = 0
-        self._file = open(path, "w", buffering=1)
+        self._file = self._open(path)
         self._earned: dict[int, tuple[float, float]] = {}
 
     def step(self) -> None:
@@ -56,6 +83,13 @@ class Episodes:
         self._reset()
         self._earned.clear()
         self._note()
+
+    def _open(self, path: Path) -> TextIO:
+        """Open the first place that is free: what a player noted outlasts its crash and a second player."""
+        for place in places(path):
+            with suppress(FileExistsError):
+                return open(place, "x", buffering=1)
+        raise AssertionError("places never end")
 
     def _note(self) -> None:
         for name in self._env.behavior_specs:

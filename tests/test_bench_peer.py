@@ -14,7 +14,7 @@ from mappo_unity.envs.unity_env import UnityEnv
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 import bench_peer
-from recorded_player import recorded_scene
+from recorded_player import EPISODES, recorded_scene
 
 
 def test_the_player_counts_returns_as_the_trainer_does(tmp_path, monkeypatch):
@@ -32,6 +32,25 @@ def test_the_player_counts_returns_as_the_trainer_does(tmp_path, monkeypatch):
     assert sorted(value for _, value in noted) == pytest.approx(returns)
     decided_at = [at for at, _ in noted]
     assert decided_at == sorted(decided_at) and decided_at[-1] > 1000
+
+
+def test_what_a_player_noted_outlasts_the_next_one(tmp_path, monkeypatch):
+    monkeypatch.setenv("PEER_SCENE", "Basic")
+    monkeypatch.setenv("PEER_EPISODES", str(tmp_path / EPISODES))
+    torch.manual_seed(0)
+    players = [UnityEnv(recorded_scene) for _ in range(3)]
+    for env in players[:2]:  # nobody plays the third
+        env.rollout(300, break_when_any_done=False)
+    for env in players:
+        env.close()
+
+    first, second = ((tmp_path / name).read_text().splitlines() for name in (EPISODES, "episodes_1.csv"))
+    assert first and second
+    noted = bench_peer.episodes(tmp_path)
+    assert len(noted) == len(first) + len(second)
+    at = [int(line.partition(",")[0]) for line in first]
+    at += [at[-1] + int(line.partition(",")[0]) for line in second]  # it counts on
+    assert [decisions for decisions, _ in noted] == at
 
 
 def write(out: Path, trainer: str, seed: int, episodes: list[tuple[int, float, float]]) -> None:

@@ -51,6 +51,7 @@ MISTAKES = [
     ("make_zoo.py nowhere", "nowhere/config.yaml cannot be read"),
     ("race_peer.py --scenes Basic=1", "--peer and --official are needed"),
     ("race_peer.py --scenes Basic=1 --patience 0.5", "--patience: 0.5 must be a number of at least 1"),
+    ("race_peer.py --scenes StrikersVsGoalie=9", "--scenes: StrikersVsGoalie cannot be raced: no return"),
     ("race_peer.py --scenes Basic", "--scenes: Basic must be SCENE=MINUTES, such as 3DBall=3"),
     ("score_doctor.py nowhere", "nowhere: there is no such fault"),
     ("score_table.py Nope", "Nope: there is no such scene"),
