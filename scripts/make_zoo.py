@@ -29,6 +29,8 @@ from mappo_unity.runs.metrics_csv import read_metrics
 
 CARDS = ZOO_FOLDER / "zoo.csv"
 LARGEST_BYTES = 1_500_000
+FILES = "recipe", "parameters", "--config"
+"""What chooses a file of options: config.yaml keeps those, but not its name."""
 
 HEAD = """\
 # Zoo
@@ -97,8 +99,9 @@ def add(run: Path, episodes: int | None) -> list[dict[str, Any]]:
 
 def opponent(run: Path) -> list[str]:
     """Return the option that makes matches of the episodes, in scenes with two sides."""
-    columns = read_metrics(run / "metrics.csv")[-1]
-    return ["opponent=random"] if "win_rate_vs_random" in columns else []
+    # the row after the last series has none of its figures
+    played = any("win_rate_vs_random" in row for row in read_metrics(run / "metrics.csv"))
+    return ["opponent=random"] if played else []
 
 
 def given(run: Path) -> list[str]:
@@ -116,9 +119,13 @@ def beyond_preset(lines: list[str], run: Path) -> list[str]:
     own = compose_config([], run / "config.yaml").tree
     preset = compose_config([f"env={own.env.name}"]).tree
 
-    names = [line.partition("=")[0] for line in lines]
-    differs = [OmegaConf.select(own, name) != OmegaConf.select(preset, name) for name in names]
-    return [line for line, is_own in zip(lines, differs) if is_own]
+    def is_own(line: str) -> bool:
+        name, _, value = line.partition("=")
+        if name in FILES:
+            return value not in ("none", "null")
+        return bool(OmegaConf.select(own, name) != OmegaConf.select(preset, name))
+
+    return [line for line in lines if is_own(line)]
 
 
 def earned(said: dict[str, Any], behavior: str) -> str:

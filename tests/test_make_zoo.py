@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pytest
 import yaml
 from omegaconf import OmegaConf, open_dict
 
@@ -37,3 +38,23 @@ def test_what_the_preset_has_as_well_is_no_option_of_a_card(tmp_path):
         tree.pop("hydra")
     OmegaConf.save(tree, tmp_path / "config.yaml")
     assert make_zoo.beyond_preset([own[0], *same, own[2]], tmp_path) == [own[0], own[2]]
+
+    chosen = ["recipe=mlagents", "--config=mine.yaml", "parameters=WallJump_curriculum"]
+    assert make_zoo.beyond_preset([*chosen, *same], tmp_path) == chosen
+    assert not make_zoo.beyond_preset(["recipe=none", "recipe=null", "parameters=none"], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        (
+            ["win_rate_vs_random", "0.9", "0.95", ""],
+            ["opponent=random"],
+        ),  # the last row is after it
+        (["entropy", "1.0", "0.9", "0.8"], []),
+    ],
+)
+def test_a_run_that_played_matches_is_measured_by_matches(rows, expected, tmp_path):
+    lines = [f"{steps},{cell}" for steps, cell in zip(["agent_steps", 1, 2, 3], rows)]
+    (tmp_path / "metrics.csv").write_text("\n".join(lines) + "\n")
+    assert make_zoo.opponent(tmp_path) == expected
