@@ -26,8 +26,14 @@ from typing import Any
 from learn_scene import append, mappo_eval, results
 from run_script import run_script
 
+from mappo_unity.errors import ConfigError
+from mappo_unity.runs.json_record import read_json
+from mappo_unity.scenes.registry import make_scene
+
 ROOT = Path(__file__).resolve().parents[1]
 TRAIN = "import sys; from mappo_unity.cli import train_main; sys.exit(train_main())"
+TWO_SIDED = "SoccerTwos", "StrikersVsGoalie"
+DONE = "trained.json"  # what is to be noted of a training, in a folder that is not evaluated yet
 QUIET = ["log.progress=false", "log.backends=[]", "matches.interval=null", "update_threads=1"]
 
 
@@ -46,6 +52,9 @@ def main() -> None:
     if not (arguments.before / "mappo_unity").is_dir():
         parser.error(f"{arguments.before} must be a checkout: it has no mappo_unity/")
 
+    for scene in arguments.scenes:
+        check_score(scene)
+
     out = arguments.out.resolve()
     for scene in arguments.scenes:
         for seed in arguments.seeds:
@@ -59,10 +68,29 @@ def main() -> None:
 
 
 def run(scene: str, seed: int, arguments: argparse.Namespace, checkout: Path, folder: Path) -> dict[str, Any]:
-    """Train once with a checkout and evaluate; return a row of results."""
+    """Train once with a checkout, unless that has been done, and evaluate; return a row of results."""
+    facts = read_json(folder / DONE)
+    if facts.get("decisions") != arguments.steps:
+        facts = train(scene, seed, arguments.steps, checkout, folder)
+        (folder / DONE).write_text(json.dumps(facts))
+
+    return {
+        "scene": scene,
+        "seed": seed,
+        **{name: facts[name] for name in ("decisions", "seconds", "cpu_seconds")},
+        **score(scene, arguments.episodes, folder),
+        "load_before": facts["load_before"],
+        "load_after": round(os.getloadavg()[0], 1),
+        "date": time.strftime("%Y-%m-%d"),
+        "folder": str(folder),
+    }
+
+
+def train(scene: str, seed: int, steps: int, checkout: Path, folder: Path) -> dict[str, Any]:
+    """Train once with a checkout; return what is to be noted of it."""
     shutil.rmtree(folder, ignore_errors=True)  # of a run that was cut off
     folder.parent.mkdir(parents=True, exist_ok=True)
-    lines = [f"env={scene}", f"seed={seed}", f"max_steps={arguments.steps}", *QUIET]
+    lines = [f"env={scene}", f"seed={seed}", f"max_steps={steps}", *QUIET]
     environment = os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
     load, start, used = os.getloadavg()[0], time.monotonic(), os.times().children_user
@@ -71,29 +99,33 @@ def run(scene: str, seed: int, arguments: argparse.Namespace, checkout: Path, fo
         subprocess.run(command, cwd=checkout, env=environment, stdout=log, stderr=log, check=True)
 
     return {
-        "scene": scene,
-        "seed": seed,
-        "decisions": arguments.steps,
+        "decisions": steps,
         "seconds": round(time.monotonic() - start),
         "cpu_seconds": round(os.times().children_user - used),
-        **score(scene, arguments.episodes, folder),
         "load_before": round(load, 1),
-        "load_after": round(os.getloadavg()[0], 1),
-        "date": time.strftime("%Y-%m-%d"),
-        "folder": str(folder),
     }
+
+
+def check_score(scene: str) -> None:
+    """Raise ConfigError where no one number says what a run of a scene earns."""
+    env = make_scene(scene, num_areas=1)
+    env.reset()
+    names = sorted({name.split("?")[0] for name in env.behavior_specs})
+    env.close()
+    if len(names) > 1 and scene not in TWO_SIDED:
+        raise ConfigError(f"{scene} has no score to compare: {' and '.join(names)} earn a return each")
 
 
 def score(scene: str, episodes: int, folder: Path) -> dict[str, Any]:
     """Return what a run's last policy earns: its mean return, or its mean goal difference."""
     files = sorted((folder / "checkpoints").glob("final*.onnx"))
     if len(files) > 1:  # a file a behavior: mappo-eval wants them by name, in a folder
-        (folder / "final").mkdir()
+        (folder / "final").mkdir(exist_ok=True)
         for file in files:
             shutil.copy(file, folder / "final" / file.name.removeprefix("final_"))
     policy = folder / "final" if len(files) > 1 else files[0]
 
-    opponent = ["opponent=random"] if scene in ("SoccerTwos", "StrikersVsGoalie") else []
+    opponent = ["opponent=random"] if scene in TWO_SIDED else []
     said = mappo_eval(f"run={policy}", f"env={scene}", f"episodes={episodes}", *opponent)
     if not opponent:
         return {"score": round(said["mean_return"], 3), "details": f"standard error {said['stderr']:.3f}"}

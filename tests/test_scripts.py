@@ -42,6 +42,8 @@ MISTAKES = [
     ("clone_demos.py nowhere", "does not exist"),
     ("compare_critics.py Nope", "Nope: critics are compared in"),
     ("compare_versions.py nowhere", "nowhere must be a checkout"),
+    (f"compare_versions.py {SCRIPTS.parent} --scenes WallJump", "WallJump has no score to compare"),
+    (f"compare_versions.py {SCRIPTS.parent} --scenes Nope", NO_SCENE),
     ("curve_against.py random nowhere", "nowhere does not exist"),
     ("curve_spread.py nowhere", "run=nowhere does not exist"),
     ("curve_table.py 1e6 nowhere", "nowhere does not exist"),
