@@ -2,16 +2,15 @@
 """Train the scenes of cooperation with each kind of critic, and draw their returns in one picture a scene.
 
 MAPPO's central critic, independent learners' local one (IPPO), MA-POCA's and attention; all else is the
-preset of the scene. With fewer --steps than the preset's its entropy bonus and learning rate fall as in its
-beginning. The table has what the final checkpoints earn in the scene as it is (of a preset with lessons: in
-the last one, wherever a seed has come to), the picture the way there. Runs lie in OUT/SCENE-CRITIC-SEED and
-are resumed after any interruption; what was trained and played is appended to docs/benchmarks/critics.csv and
-critics_played.csv and is not run again. Table and picture stand on the scene's page.
+preset of the scene. With fewer --steps than the preset's its entropy bonus, learning rate and discount move
+as in its beginning. The table has what the final checkpoints earn in the scene as it is (of a preset with
+lessons: in the last one, wherever a seed has come to), the picture the way there. Runs lie in
+OUT/SCENE-CRITIC-SEED and are resumed after any interruption; what was trained and played is appended to
+docs/benchmarks/critics.csv and critics_played.csv and is not run again. Table and picture (which needs
+matplotlib) stand on the scene's page.
 
     python scripts/compare_critics.py DungeonEscape [--critics central local] [--seeds 0 1 2] [--steps N]
     python scripts/compare_critics.py --draw                  # only the tables and the pictures
-
-The pictures need matplotlib.
 """
 
 from __future__ import annotations
@@ -33,6 +32,8 @@ from score_page import BENCHMARKS, ROOT, put_between
 from score_table import last_lesson, train
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.config.schema import PPOConfig, Schedule
+from mappo_unity.learning.advantage import part_over
 from mappo_unity.runs.checkpoint_file import checkpoints_in, step_of
 from mappo_unity.runs.metrics_csv import read_metrics
 
@@ -178,7 +179,22 @@ def options(scene: str, critic: str, steps: int) -> list[str]:
     lr = ppo.lr + fallen * (ppo.lr_final - ppo.lr)
     entropy = ppo.entropy_coef + fallen * (ppo.entropy_coef_final - ppo.entropy_coef)
     finals = [f"ppo.lr_final={lr:.6g}", f"ppo.entropy_coef_final={entropy:.6g}"]
-    return [f"model.critic={critic}", f"max_steps={steps}", *finals, "update_threads=1"]
+    discount = discount_options(ppo, fallen)
+    return [f"model.critic={critic}", f"max_steps={steps}", *finals, *discount, "update_threads=1"]
+
+
+def discount_options(ppo: PPOConfig, share: float) -> list[str]:
+    """Return the options that move the discount over the beginning of a run, this share of it, as there."""
+    if ppo.gamma_schedule is Schedule.constant or share == 1:
+        return []
+    begins, until = ppo.gamma_from / share, ppo.gamma_until / share
+    if begins >= 1:
+        return ["ppo.gamma_schedule=constant"]
+    lines = [f"ppo.gamma_from={begins:.6g}", f"ppo.gamma_until={min(1.0, until):.6g}"]
+    if until > 1:  # it ends on the way
+        final = ppo.gamma + part_over(1.0, begins, until) * (ppo.gamma_final - ppo.gamma)
+        lines.append(f"ppo.gamma_final={final:.6g}")
+    return lines
 
 
 def read_curves() -> dict[str, Curves]:

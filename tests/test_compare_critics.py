@@ -15,6 +15,7 @@ from decisions_to import settled, with_value
 from learn_scene import append
 
 from mappo_unity.config.compose import compose_config
+from mappo_unity.learning.rewards.streams import RewardStreams
 from mappo_unity.runs.folder import write_record
 
 
@@ -44,6 +45,32 @@ def test_every_critic_is_trained_by_the_presets_schedule(scene: str, critic: str
     middle = (preset.ppo.entropy_coef + preset.ppo.entropy_coef_final) / 2
     assert config.ppo.entropy_coef_final == pytest.approx(middle)
     assert config.ppo.lr_final == pytest.approx((preset.ppo.lr + preset.ppo.lr_final) / 2)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.75, 1.0])
+@pytest.mark.parametrize("part", [(0.4, 0.4), (0.25, 0.625), (0.0, 1.0), (0.2, 1.0)])
+def test_the_discount_of_a_shorter_run_moves_as_in_the_beginning(
+    share: float, part: tuple[float, float]
+) -> None:
+    moves = ["ppo.gamma_schedule=linear", "ppo.gamma=0.9", "ppo.gamma_final=0.998"]
+    whole = [*moves, *(f"ppo.{name}={value}" for name, value in zip(("gamma_from", "gamma_until"), part))]
+    preset = compose_config(whole).config.ppo
+    shorter = compose_config([*whole, *compare_critics.discount_options(preset, share)]).config.ppo
+
+    for over in (0.0, 0.1, 0.3, 0.55, 0.79, 0.81, 0.99):
+        there, here = RewardStreams(preset), RewardStreams(shorter)
+        there.begin(over * share)
+        here.begin(over)
+        assert here.gammas == pytest.approx(there.gammas, abs=1e-6)
+
+
+def test_only_a_shorter_run_has_a_discount_of_its_own() -> None:
+    def moved(scene: str, steps: int) -> list[str]:
+        lines = compare_critics.options(scene, "local", steps)
+        return [line for line in lines if line.startswith("ppo.gamma")]
+
+    assert moved("DungeonEscape", 1_000_000) == ["ppo.gamma_from=0.8", "ppo.gamma_until=0.8"]
+    assert not moved("DungeonEscape", 2_000_000) and not moved("CooperativePushBlock", 1_000_000)
 
 
 def test_a_row_has_the_seeds_of_a_critic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
