@@ -24,7 +24,7 @@ def test_every_file_has_a_card_and_is_small():
 @pytest.mark.parametrize("card", CARDS, ids=lambda card: card["behavior"])
 def test_a_file_plays_its_scene(card):
     policy = OnnxFolder(ZOO_FOLDER, deterministic=False)
-    env = make_scene(card["scene"], num_areas=1)
+    env = make_scene(card["scene"], num_areas=8)  # of one wall alone WallJump begins with a big one
     env.reset()
 
     for name in env.behavior_specs:
@@ -32,9 +32,9 @@ def test_a_file_plays_its_scene(card):
             spec = env.behavior_specs[name]
             policy.check(name, spec)
             decision, _ = env.get_steps(name)
-            if len(decision):  # not every agent begins with a small wall
-                env.set_actions(name, policy.act(name, decision, spec))
-                env.step()
+            assert len(decision), "nothing is played"
+            env.set_actions(name, policy.act(name, decision, spec))
+            env.step()
             break
     else:
         pytest.fail(f"{card['scene']} has no behavior {card['behavior']}")
