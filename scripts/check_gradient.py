@@ -177,7 +177,7 @@ def show_critic(learner: Learner, episodes: list[Episode], gamma: float) -> None
 
     critic = copy.deepcopy(learner.critic.module).train()
     optimizer = torch.optim.Adam(critic.parameters(), lr=FIT_RATE)
-    targets = learner.norm.normalize(known[1].unsqueeze(-1))
+    targets = learner.norm.normalize(known[1].unsqueeze(-1))[:, :1]  # of the environment's rewards
     for epoch in range(1, EPOCHS + 1):
         for rows in torch.randperm(len(targets)).split(FIT_BATCH):
             loss = ((critic(known[0][rows].unsqueeze(1)).squeeze(1)[:, :1] - targets[rows]) ** 2).mean()
