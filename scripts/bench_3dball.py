@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from bench_update import measure, timed
 from mlagents_envs.base_env import ActionTuple
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
@@ -34,7 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--repeats", type=positive, default=5)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--seeds", type=int, default=0, help="also train seeds 0 .. N-1 to the end, default options"

@@ -20,7 +20,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from run_script import check_names, run_script
+from run_script import check_names, positive, run_script
 
 from mappo_unity.scenes.registry import BUILT_IN
 
@@ -82,8 +82,8 @@ def main() -> None:
         "folder", type=Path, metavar="FOLDER", help="the other checkout, such as a git worktree"
     )
     parser.add_argument("--scene", default="CooperativePushBlock")
-    parser.add_argument("--num-areas", type=int, default=4)
-    parser.add_argument("--turns", type=int, default=150)
+    parser.add_argument("--num-areas", type=positive, default=4)
+    parser.add_argument("--turns", type=positive, default=150)
     parser.add_argument("--forward", action="store_true", help="push, in a scene of blocks")
     options = parser.parse_args()
     if not (options.folder / "scripts" / "bench_scenes.py").is_file():

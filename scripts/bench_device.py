@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 from bench_scaling import ENDLESS, WARM_UP
 from rich.console import Console
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.runs.metrics_csv import read_metrics
@@ -51,7 +51,7 @@ def main() -> None:
         "cases", nargs="*", default=CASES, metavar="CASE", help="options of a run, as one text"
     )
     parser.add_argument("--devices", nargs="+", default=["device=cpu update_threads=1", "device=cuda"])
-    parser.add_argument("--iterations", type=int, default=5, help="those that are counted")
+    parser.add_argument("--iterations", type=positive, default=5, help="those that are counted")
     arguments = parser.parse_args()
 
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"

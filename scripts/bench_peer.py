@@ -32,7 +32,7 @@ from typing import Any
 from learn_scene import append, results
 from peer_command import add_peer_options, check_peer_options, their_command
 from recorded_player import EPISODES, ROOT, make_player, noted
-from run_script import run_script
+from run_script import positive, run_script
 
 TRAINERS = "mlagents-learn", "mappo-unity"
 COLORS = "tab:orange", "tab:blue"
@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["3DBall", "Basic", "DungeonEscape", "Hallway"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--trainers", nargs="+", choices=TRAINERS, default=TRAINERS)
-    parser.add_argument("--steps", type=int, default=300_000, help="agent decisions of a run")
+    parser.add_argument("--steps", type=positive, default=300_000, help="agent decisions of a run")
     parser.add_argument("--out", type=Path, default=Path("outputs/peer"))
     parser.add_argument("options", nargs="*", help="further options of mappo-train")
     arguments = parser.parse_intermixed_args()

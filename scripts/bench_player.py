@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from player_stepping import Stepping, cpu_s, median_ratio, mlagents_client, our_client
 from round_parts import player_pid, print_parts
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.cli.player import run as player_main
 from mappo_unity.config.compose import compose_config
@@ -39,12 +39,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scene", default="3DBall")
-    parser.add_argument("--areas", type=int, default=None, help="areas of the scene; default: as in Unity")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--rounds", type=int, default=300, help="environment steps of one measurement")
+    parser.add_argument("--areas", type=positive, help="areas of the scene; default: as in Unity")
+    parser.add_argument("--repeats", type=positive, default=5)
+    parser.add_argument("--rounds", type=positive, default=300, help="environment steps of one measurement")
     parser.add_argument("--train", action="store_true", help="train to --goal, too")
     parser.add_argument("--goal", type=float, default=95.0, help="mean return to train to")
-    parser.add_argument("--max-steps", type=int, default=None, help="agent steps to train at most")
+    parser.add_argument("--max-steps", type=positive, default=None, help="agent steps to train at most")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 

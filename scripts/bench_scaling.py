@@ -21,7 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.errors import ConfigError
@@ -41,10 +41,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="*", default=["3DBall", "SoccerTwos"])
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--iterations", type=int, default=6, help="timed ones of each repeat")
-    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--learners", type=int, nargs="+", default=[2])
+    parser.add_argument("--repeats", type=positive, default=5)
+    parser.add_argument("--iterations", type=positive, default=6, help="timed ones of each repeat")
+    parser.add_argument("--workers", type=positive, nargs="+", default=[1, 2])
+    parser.add_argument("--learners", type=positive, nargs="+", default=[2])
     parser.add_argument("--engine", choices=["processes", "ray"], default="processes", help="of workers")
     parser.add_argument("--option", action="append", default=[], help="a further option of every run")
     arguments = parser.parse_args()

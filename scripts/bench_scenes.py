@@ -24,7 +24,7 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import numpy as np  # noqa: E402
 from mlagents_envs.base_env import ActionSpec, ActionTuple, BaseEnv, BehaviorSpec, DecisionSteps  # noqa: E402
 from omegaconf import OmegaConf  # noqa: E402
-from run_script import run_script  # noqa: E402
+from run_script import positive, run_script  # noqa: E402
 
 from mappo_unity.config.presets import conf_dir  # noqa: E402
 from mappo_unity.scenes import make_scene, scene_names  # noqa: E402
@@ -106,10 +106,10 @@ def main() -> None:
     )
     parser.add_argument("scenes", nargs="*", help="default: all scenes")
     parser.add_argument(
-        "--num-areas", type=int, default=None, help="default: as the Unity scene, then as the preset"
+        "--num-areas", type=positive, default=None, help="default: as the Unity scene, then as the preset"
     )
     parser.add_argument("--seconds", type=float, default=2.0, help="of one repeat")
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--repeats", type=positive, default=5)
     options = parser.parse_args()
     rows = [
         (scene, "random", num_areas, random_policy())

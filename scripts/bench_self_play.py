@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
@@ -36,7 +36,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("words", nargs="*", help="scenes, and options of both runs")
-    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--repeats", type=positive, default=9)
     arguments = parser.parse_intermixed_args()
 
     options = [word for word in arguments.words if "=" in word]

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from run_script import run_script
+from run_script import positive, run_script
 from torch import Tensor, nn
 from torch.distributions import Categorical, Normal
 
@@ -38,7 +38,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="*", default=["3DBall", "SoccerTwos", "Hallway"])
-    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--repeats", type=positive, default=9)
     arguments = parser.parse_args()
 
     print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores, one torch thread")

@@ -20,7 +20,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from run_script import run_script
+from run_script import positive, run_script
 
 HERE = Path(__file__).resolve().parents[1]
 CODE = "import sys; from mappo_unity.cli import play_main; sys.exit(play_main(sys.argv[1:]))"
@@ -81,9 +81,9 @@ def main() -> None:
     )
     parser.add_argument("scenes", nargs="*", default=["3DBall", "Pyramids", "SoccerTwos", "Walker"])
     parser.add_argument("--seconds", type=float, default=4.0, help="length of the videos")
-    parser.add_argument("--width", type=int, default=960)
-    parser.add_argument("--height", type=int, default=544)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--width", type=positive, default=960)
+    parser.add_argument("--height", type=positive, default=544)
+    parser.add_argument("--repeats", type=positive, default=3)
     parser.add_argument("--beside", type=Path, help="another checkout, to compare with")
     options = parser.parse_args()
     size = options.width, options.height

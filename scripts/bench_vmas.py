@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; default: all")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--set", nargs="+", default=[], metavar="OPTION=VALUE", help="further options")
-    parser.add_argument("--frames", type=int, default=None, help="instead of the task's own number")
+    parser.add_argument("--frames", type=positive, default=None, help="instead of the task's own number")
     parser.add_argument("--curve", action="store_true", help="print every evaluation")
     arguments = parser.parse_args()
     for name in arguments.tasks:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from play_scene import play_until
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.scenes.core.ground import TICK_S
@@ -85,8 +85,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--policy", required=True, help="an ONNX file, a run, or random")
-    parser.add_argument("--episodes", type=int, default=800, help="of areas, at least")
-    parser.add_argument("--num-areas", type=int, default=64)
+    parser.add_argument("--episodes", type=positive, default=800, help="of areas, at least")
+    parser.add_argument("--num-areas", type=positive, default=64)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--sight", action="store_true", help="also how often players see the fastest dragons")
     options = parser.parse_args()

@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.envs.backends import MakeEnv, make_env_function
 from mappo_unity.errors import ConfigError
@@ -190,11 +190,11 @@ def _parser() -> argparse.ArgumentParser:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder or checkpoint")
-    parser.add_argument("--episodes", type=int, default=2000, help="agent episodes of each behavior")
+    parser.add_argument("--episodes", type=positive, default=2000, help="agent episodes of each behavior")
     parser.add_argument(
         "--plays", nargs="+", choices=PLAYS, default=PLAYS, metavar="PLAY", help=" ".join(PLAYS)
     )
-    parser.add_argument("--areas", type=int, default=4, help="areas of the scene")
+    parser.add_argument("--areas", type=positive, default=4, help="areas of the scene")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--allow", type=float, default=2.0, help="standard errors of difference")
     parser.add_argument("--run-policy", type=Path, default=RUN_POLICY, metavar="PATH")

@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 import torch
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.policies.matches import find_sides, play_side
 from mappo_unity.policies.policy import CheckpointPolicy, Policy
@@ -26,7 +26,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("checkpoints", nargs="+", type=Path)
-    parser.add_argument("--matches", type=int, default=200)
+    parser.add_argument("--matches", type=positive, default=200)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
 

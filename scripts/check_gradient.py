@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from mlagents_envs.base_env import ActionTuple
-from run_script import run_script
+from run_script import positive, run_script
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -216,9 +216,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--run", required=True, help="a run folder or a checkpoint")
-    parser.add_argument("--decisions", type=int, default=150_000)
-    parser.add_argument("--batch-size", type=int, default=2560)
-    parser.add_argument("--num-areas", type=int, default=64)
+    parser.add_argument("--decisions", type=positive, default=150_000)
+    parser.add_argument("--batch-size", type=positive, default=2560)
+    parser.add_argument("--num-areas", type=positive, default=64)
     parser.add_argument("--gamma", type=float, default=0.99)
     parser.add_argument("--gae-lambda", type=float, default=0.95)
     parser.add_argument("--seed", type=int, default=0)

@@ -17,7 +17,7 @@ import os
 from pathlib import Path
 
 from learn_scene import mappo_eval
-from run_script import run_script
+from run_script import positive, run_script
 from score_measures import as_strikers
 from score_table import train
 
@@ -31,9 +31,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--steps", type=int, default=3_500_000)
+    parser.add_argument("--steps", type=positive, default=3_500_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--matches", type=int, default=200)
+    parser.add_argument("--matches", type=positive, default=200)
     parser.add_argument("--minutes", type=float, default=120.0, help="of collecting and learning, for a run")
     parser.add_argument("--out", type=Path, default=Path("outputs/novelty"))
     arguments = parser.parse_args()

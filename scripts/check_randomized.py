@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 from learn_scene import HERE, mappo_eval
-from run_script import run_script
+from run_script import positive, run_script
 
 BALLS = [
     (mass, scale) for mass in (0.5, 1, 10) for scale in (0.75, 1, 3)
@@ -25,9 +25,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--steps", type=int, default=40_000)
+    parser.add_argument("--steps", type=positive, default=40_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--episodes", type=positive, default=200)
     arguments = parser.parse_args()
 
     print(

@@ -25,7 +25,7 @@ import mappo_unity.protocol.protobuf
 mappo_unity.protocol.protobuf.install()
 
 from mlagents_envs.base_env import ActionTuple, TerminalSteps  # noqa: E402
-from run_script import run_script  # noqa: E402
+from run_script import positive, run_script  # noqa: E402
 
 from mappo_unity.scenes import make_scene  # noqa: E402
 
@@ -130,7 +130,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--episodes", type=int, default=400)
+    parser.add_argument("--episodes", type=positive, default=400)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--policy", type=Path, default=shared_folder() / "oracle" / "SoccerTwos.onnx")
     args = parser.parse_args()

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from play_scene import play_until
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.policies.evaluate import open_policy
 from mappo_unity.scenes.walker import body
@@ -111,8 +111,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--policy", required=True, help="an ONNX file, a run, or random")
-    parser.add_argument("--episodes", type=int, default=8, help="of each area")
-    parser.add_argument("--num-areas", type=int, default=64)
+    parser.add_argument("--episodes", type=positive, default=8, help="of each area")
+    parser.add_argument("--num-areas", type=positive, default=64)
     parser.add_argument("--deterministic", action="store_true", help="without sampling")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()

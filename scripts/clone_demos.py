@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 from learn_scene import HERE, mappo_eval
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.protocol.demos.reader import read_demo
 
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", nargs="+", choices=DEMOS, default=list(DEMOS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--episodes", type=positive, default=100)
     arguments = parser.parse_args()
 
     print(f"load average {os.getloadavg()[0]:.2f}, {os.cpu_count()} cores", flush=True)

@@ -16,7 +16,7 @@ import statistics
 import tempfile
 from pathlib import Path
 
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.config.schema import Config
@@ -40,7 +40,7 @@ def main() -> None:
     )
     parser.add_argument("env", help="env=NAME and further overrides joined by '+'")
     parser.add_argument("--seconds", type=float, default=None, help="wall-clock budget of a variant")
-    parser.add_argument("--steps", type=int, default=None, help="agent decisions of a variant")
+    parser.add_argument("--steps", type=positive, default=None, help="agent decisions of a variant")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--goal", type=float, default=95.0, help="mean return whose first time is printed")
     parser.add_argument("--matches", type=int, default=0, help="matches against a random side at the end")

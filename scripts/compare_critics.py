@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 from decisions_to import last_lessons, settled, with_value
 from learn_scene import append, mappo_eval, read_rows, thin
-from run_script import run_script
+from run_script import positive, run_script
 from score_measures import measures_of
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import last_lesson, train
@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=list(SCENES), metavar="SCENE", help=", ".join(SCENES))
     parser.add_argument("--critics", nargs="+", default=list(CRITICS), choices=list(CRITICS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--steps", type=int, help="agent decisions of a run, instead of the scene's")
+    parser.add_argument("--steps", type=positive, help="agent decisions of a run, instead of the scene's")
     parser.add_argument("--minutes", type=float, default=240.0, help="of collecting and learning, for a run")
     parser.add_argument("--out", type=Path, default=Path("outputs/critics"))
     parser.add_argument("--draw", action="store_true", help="run nothing")

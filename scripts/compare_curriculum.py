@@ -20,7 +20,7 @@ from pathlib import Path
 
 from decisions_to import Metrics, columns_of, in_last_lesson, reached_cells, with_value
 from learn_scene import append, mappo_eval, read_rows
-from run_script import run_script
+from run_script import positive, run_script
 from score_measures import behavior_return
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("--ways", nargs="+", default=keys, choices=keys)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--minutes", type=float, default=120.0, help="of collecting and learning, for a run")
-    parser.add_argument("--episodes", type=int, default=2000, help="of the evaluation of a run's best policy")
+    parser.add_argument("--episodes", type=positive, default=2000, help="of the evaluation of a run's best")
     parser.add_argument("--out", type=Path, default=Path("outputs/curriculum"))
     parser.add_argument("--draw", action="store_true", help="run nothing")
     arguments = parser.parse_args()

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from decisions_to import columns_of, first_at, reached_cells
 from learn_scene import append, mappo_eval, read_rows
-from run_script import run_script
+from run_script import positive, run_script
 from score_page import BENCHMARKS, ROOT, put_between
 from score_table import train
 
@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--demos", type=Path, help="folder of the recordings")
     parser.add_argument("--minutes", type=float, default=120.0, help="of collecting and learning, for a run")
-    parser.add_argument("--episodes", type=int, default=400, help="of the evaluation of a run's best policy")
+    parser.add_argument("--episodes", type=positive, default=400, help="of the evaluation of a run's best")
     parser.add_argument("--out", type=Path, default=Path("outputs/signals"))
     parser.add_argument("--draw", action="store_true", help="run nothing")
     arguments = parser.parse_args()

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from learn_scene import append, mappo_eval, results
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.json_record import read_json
@@ -45,8 +45,8 @@ def main() -> None:
     parser.add_argument("before", type=Path, help="the other checkout")
     parser.add_argument("--scenes", nargs="+", default=["DungeonEscape", "StrikersVsGoalie", "SoccerTwos"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--steps", type=int, default=1_000_000, help="agent decisions of a run")
-    parser.add_argument("--episodes", type=int, default=400, help="episodes or matches of an evaluation")
+    parser.add_argument("--steps", type=positive, default=1_000_000, help="agent decisions of a run")
+    parser.add_argument("--episodes", type=positive, default=400, help="episodes or matches of an evaluation")
     parser.add_argument("--out", type=Path, default=Path("outputs/versions"))
     arguments = parser.parse_args()
     if not (arguments.before / "mappo_unity").is_dir():

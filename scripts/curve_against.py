@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 from learn_scene import append
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.evaluate import open_policy
@@ -34,7 +34,7 @@ def main() -> None:
     )
     parser.add_argument("opponent")
     parser.add_argument("runs", nargs="+", type=Path)
-    parser.add_argument("--matches", type=int, default=100)
+    parser.add_argument("--matches", type=positive, default=100)
     parser.add_argument("--every", type=int, default=1_000_000, help="decisions between two points")
     parser.add_argument("--out", type=Path, default=Path("curve.csv"))
     arguments = parser.parse_args()

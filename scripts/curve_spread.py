@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.envs.backends import make_env_function
 from mappo_unity.policies.episodes import play, summarize
@@ -39,7 +39,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", nargs="+", type=Path)
-    parser.add_argument("--episodes", type=int, default=300, help="agent episodes of each policy")
+    parser.add_argument("--episodes", type=positive, default=300, help="agent episodes of each policy")
     parser.add_argument("--out", type=Path, default=Path("spread.png"))
     arguments = parser.parse_args()
 

@@ -14,7 +14,7 @@ import subprocess
 from pathlib import Path
 
 from learn_scene import HERE
-from run_script import run_script
+from run_script import check_names, run_script
 from score_table import has_policies
 
 from mappo_unity.policies.policy_files import ZOO_FOLDER
@@ -37,6 +37,7 @@ def main() -> None:
     )
     parser.add_argument("scenes", nargs="*")
     scenes = parser.parse_args().scenes or [name for name in BUILT_IN if has_policies(ZOO_FOLDER, name)]
+    check_names(scenes, BUILT_IN, "scene")
 
     for scene in scenes:
         path = PLACE / f"{scene}.gif"

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.checkpoint_file import checkpoints_in
@@ -43,7 +43,7 @@ def main() -> None:
     )
     parser.add_argument("scene")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--episodes", type=int, default=400)
+    parser.add_argument("--episodes", type=positive, default=400)
     parser.add_argument("--out", type=Path, default=Path("outputs/learn"))
     parser.add_argument("options", nargs="*", help="further options of mappo-train")
     arguments = parser.parse_intermixed_args()  # options may stand anywhere

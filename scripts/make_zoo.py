@@ -18,7 +18,7 @@ from typing import Any
 
 from learn_scene import mappo_eval, read_rows
 from omegaconf import OmegaConf
-from run_script import run_script
+from run_script import positive, run_script
 from score_measures import measures_of
 
 from mappo_unity.config.compose import compose_config, load_config
@@ -55,7 +55,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN")
-    parser.add_argument("--episodes", type=int, help="instead of the score table's")
+    parser.add_argument("--episodes", type=positive, help="instead of the score table's")
     arguments = parser.parse_args()
 
     cards = {card["behavior"]: card for card in read_rows(CARDS)}

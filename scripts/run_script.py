@@ -1,10 +1,12 @@
-"""How the scripts of this folder end: what their user can mend is one line and exit code 2."""
+"""How the scripts of this folder take counts and names, and end: a mistake is one line and exit code 2."""
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -30,6 +32,14 @@ def run_script(main: Callable[[], int | None]) -> NoReturn:
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def positive(word: str) -> int:
+    """Return the count that a word is, as a type of argparse's; raises ArgumentTypeError."""
+    with suppress(ValueError):
+        if (count := int(word)) >= 1:
+            return count
+    raise argparse.ArgumentTypeError(f"{word} must be a whole number of at least 1")
 
 
 def check_names(names: Iterable[str], known: Collection[str], what: str) -> None:

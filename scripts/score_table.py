@@ -25,7 +25,7 @@ from typing import Any
 
 from decisions_to import read_last_lesson, with_value
 from learn_scene import HERE, append, begin_or_resume, mappo_eval, read_rows, thin
-from run_script import check_names, run_script
+from run_script import check_names, positive, run_script
 from score_measures import MEASURES, Measure, measures_of
 from score_page import CURVES, FIXED, SCORES, write_page
 
@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("words", nargs="*", metavar="SCENE|OPTION")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--minutes", type=float, default=120.0, help="of collecting and learning, for a run")
-    parser.add_argument("--episodes", type=int, help="of each evaluation, instead of score_measures'")
+    parser.add_argument("--episodes", type=positive, help="of each evaluation, instead of score_measures'")
     parser.add_argument("--out", type=Path, default=Path("outputs/scores"))
     parser.add_argument("--unity", type=Path, help="folder of Unity's own policies, BEHAVIOR.onnx")
     parser.add_argument("--draw", action="store_true", help="run nothing")

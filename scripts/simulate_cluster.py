@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from run_script import run_script
+from run_script import positive, run_script
 
 from mappo_unity.config.compose import compose_config
 from mappo_unity.training.collection.fleet import weights_of
@@ -54,7 +54,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scene", default="SoccerTwos")
-    parser.add_argument("--iterations", type=int, default=12, help="measured ones")
+    parser.add_argument("--iterations", type=positive, default=12, help="measured ones")
     parser.add_argument("--link", type=float, default=10.0, help="Gbit/s of each machine")
     parser.add_argument("--speedup", type=float, nargs="+", default=[1.0, 20.0], help="of learning")
     parser.add_argument("--cores", type=int, default=64, help="of a machine; two of them are the learner's")

@@ -26,7 +26,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from run_script import run_script
+from run_script import positive, run_script
 
 HANG_TIMEOUT_S = 5.0
 
@@ -41,7 +41,7 @@ def main() -> int:
     parser.add_argument("--malformed", type=int, default=5)
     parser.add_argument("--nan", type=int, default=2)
     parser.add_argument("--every-s", type=float, default=1.5, help="mean time between two troubles")
-    parser.add_argument("--max-steps", type=int, default=4_000_000)
+    parser.add_argument("--max-steps", type=positive, default=4_000_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("options", nargs="*", help="further options of mappo-train")
     arguments = parser.parse_args()

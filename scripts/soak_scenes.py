@@ -32,7 +32,7 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from mlagents_envs.base_env import ActionTuple, BehaviorSpec, DecisionSteps, TerminalSteps  # noqa: E402
-from run_script import run_script  # noqa: E402
+from run_script import positive, run_script  # noqa: E402
 from scene_ranges.ranges import Seen  # noqa: E402
 
 from mappo_unity.scenes import make_scene  # noqa: E402
@@ -213,7 +213,7 @@ def main() -> int:
         "--scenes", nargs="+", default=list(BUILT_IN), choices=list(BUILT_IN), metavar="SCENE"
     )
     parser.add_argument("--hours", type=float, default=2.0, help="of simulated time in each scene")
-    parser.add_argument("--num-areas", type=int, default=4)
+    parser.add_argument("--num-areas", type=positive, default=4)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
 

@@ -11,6 +11,8 @@ import re
 import textwrap
 from pathlib import Path
 
+from run_script import run_script
+
 WIDTH = 100
 ROOT = Path(__file__).resolve().parents[1]
 ITEM = re.compile(r"( *)([*+-]|\d+\.) +")
@@ -102,4 +104,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)
