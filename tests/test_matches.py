@@ -163,7 +163,7 @@ def test_random_play_in_the_soccer_scenes_is_even():
 
 
 class LeftBehind(matrix_game.MatrixGame):
-    """A game whose later resets go on from where it stands: the match under way then is lost by both."""
+    """A game that the second side wins; later resets go on from where it stands, in a match that it loses."""
 
     is_used = stale = False
 
@@ -178,7 +178,7 @@ class LeftBehind(matrix_game.MatrixGame):
 
     def get_steps(self, behavior_name):
         decision, terminal = super().get_steps(behavior_name)
-        terminal.reward[:] = -1.0 if self.stale else 1.0
+        terminal.reward[:] = -1.0 if self.stale == (behavior_name == matrix_game.SIDES[1]) else 1.0
         return decision, terminal
 
 
@@ -202,9 +202,7 @@ class WithSnapshots(LeftBehind):
 def test_matches_that_begin_with_the_reset_of_a_used_environment_do_not_count(game):
     policy = RandomPolicy(0)
     scores = play_matches(lambda seed: game(seed, games=4), policy, policy, 16, seed=0)
-    assert {side: (score.wins, score.losses) for side, score in scores.items()} == dict.fromkeys(
-        matrix_game.SIDES, (8, 0)
-    )
+    assert [(score.wins, score.losses) for score in scores.values()] == [(0, 8), (8, 0)]
 
 
 class SecondLater(matrix_game.MatrixGame):
@@ -231,7 +229,7 @@ def test_a_policy_and_its_opponent_draw_numbers_of_their_own(monkeypatch):
 
 
 class LaterAndLeft(SecondLater):
-    """The same, whose later resets go on from where it stands: each side loses the first match after them."""
+    """The same, which the second side wins, and loses the first match after later resets."""
 
     is_used, since = False, 99
 
@@ -246,16 +244,14 @@ class LaterAndLeft(SecondLater):
 
     def get_steps(self, behavior_name):
         decision, terminal = super().get_steps(behavior_name)
-        first = 1 + matrix_game.SIDES.index(behavior_name)  # the step that ends its first match
-        terminal.reward[:] = -1.0 if self.since <= first else 1.0
+        is_first = self.since <= 2  # the step that ends the second side's first match
+        terminal.reward[:] = -1.0 if is_first == (behavior_name == matrix_game.SIDES[1]) else 1.0
         return decision, terminal
 
 
 def test_what_the_reset_of_a_used_environment_begins_does_not_count_for_a_later_side():
     scores = play_matches(lambda seed: LaterAndLeft(seed, games=4), Always(0), Always(1), 16, seed=0)
-    assert {side: (score.wins, score.losses) for side, score in scores.items()} == dict.fromkeys(
-        matrix_game.SIDES, (8, 0)
-    )
+    assert [(score.wins, score.losses) for score in scores.values()] == [(0, 8), (8, 0)]
 
 
 def test_both_sides_begin_at_a_snapshot_where_there_are_some():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from mlagents_envs.base_env import BaseEnv
@@ -20,12 +21,22 @@ NUM_BATCHES = 40  # of consecutive episodes, at most
 MIN_BATCH = 10  # episodes
 
 
+class Ended(NamedTuple):
+    """An episode that has ended, whether it counts or not."""
+
+    episode: Episode
+    began_at: int  # environment steps since the reset
+    ended_at: int
+    is_late: bool = False  # whether a reward came with its first decision: earned before it began
+
+
 def play(
     env: BaseEnv,
     policy: Policy | dict[str, Policy],
     episodes: int,
     only: str | None = None,
     skip_first: bool = False,
+    told: Callable[[str, Ended], None] = lambda name, ended: None,
 ) -> dict[str, list[Episode]]:
     """Play until the first ``episodes`` episodes *begun* of every behavior (or of ``only``) have ended.
 
@@ -38,6 +49,7 @@ def play(
         only: the behavior that they are counted of; None: every one.
         skip_first: whether those that begin with the reset do not count. An environment that has been played
             in may go on from where its areas stand: Unity's own reset of the academy moves no ball.
+        told: takes every episode that ends, also those that do not count, and its behavior.
 
     Returns:
         The episodes of every behavior, in the order of their ends.
@@ -47,13 +59,13 @@ def play(
         EnvironmentFailure: so many episodes do not end.
     """
     running: dict[tuple[str, int], list[float]] = {}
-    counts = _Counts(episodes, skip_first)
+    counts = _Counts(episodes, skip_first, told)
     checks: dict[str, RecordCheck] = {}
     silent = 0  # steps in a row in which nobody requested a decision
 
     env.reset()
     check_specs(env.behavior_specs)
-    for _ in range(MAX_ENV_STEPS):
+    for counts.step in range(MAX_ENV_STEPS):
         silent = 0 if _act(env, policy, checks, running, counts) else silent + 1
 
         names = [only] if only else list(env.behavior_specs)
@@ -102,10 +114,14 @@ def _endless(env: BaseEnv, episodes: int, counts: _Counts) -> EnvironmentFailure
 
 
 class _Counts:
-    """Which episodes count: the first ``wanted`` begun of each behavior; none while it ``skips``."""
+    """Which episodes count: the first ``wanted`` begun of each behavior; none while it ``skips``.
 
-    def __init__(self, wanted: int, skips: bool) -> None:
+    Attributes: `step`, of the environment since its reset; `told`, of every episode that ends.
+    """
+
+    def __init__(self, wanted: int, skips: bool, told: Callable[[str, Ended], None]) -> None:
         self.wanted, self.skips = wanted, skips
+        self.step, self.told = 0, told
         self.begun: dict[str, int] = {}  # of those that count
         self.ended: dict[str, list[Episode]] = {}
 
@@ -140,24 +156,27 @@ def _end_episodes(name: str, terminal: Any, running: dict, counts: _Counts) -> N
             continue
 
         # The last reward comes with the end, and belongs to the episode.
-        counted, individual, group, length, group_id = episode
+        counted, individual, group, length, group_id, began_at, is_late = episode
         individual, group = (
             individual + float(terminal.reward[row]),
             group + float(terminal.group_reward[row]),
         )
 
+        cut = bool(terminal.interrupted[row])
+        # the group of its decisions: Unity's UnregisterAgent takes it out of that before it ends
+        ended = Episode(agent, individual, group, int(length), cut, int(group_id))
         if counted:
-            cut = bool(terminal.interrupted[row])
-            # that of its decisions: Unity's UnregisterAgent takes it out of its group before it ends
-            ended = Episode(agent, individual, group, int(length), cut, int(group_id))
             counts.ended.setdefault(name, []).append(ended)
+        counts.told(name, Ended(ended, int(began_at), counts.step, bool(is_late)))
 
 
 def _go_on(name: str, decision: Any, running: dict, counts: _Counts) -> None:
     for row, agent in enumerate(decision.agent_id.tolist()):
         episode = running.get((name, agent))
         if episode is None:
-            episode = running[name, agent] = [float(counts.begin(name)), 0.0, 0.0, 0.0, 0.0]
+            is_late = float(decision.reward[row] != 0 or decision.group_reward[row] != 0)
+            begun = [float(counts.begin(name)), 0.0, 0.0, 0.0, 0.0, float(counts.step), is_late]
+            episode = running[name, agent] = begun
 
         episode[1] += float(decision.reward[row])
         episode[2] += float(decision.group_reward[row])

@@ -2,14 +2,16 @@
 
 A side is a team id (``Name?team=1``): its behaviors belong to one policy.
 
-A match is one episode of a team. The side whose group reward (individual reward where there are no
-groups) is positive at its end, that of its last member, has won, one with a negative one has lost;
-anything else is a draw.
+A match is one episode of a team. The side with the higher return has won: of its group rewards, as its last
+member earned them, of individual rewards where there are no groups. Equal returns are a draw. Where it cannot
+be told what the other side earned in the match (`match_pairs`), a side with a positive return has won, and
+one with a negative one has lost.
 """
 
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,8 +23,9 @@ from mappo_unity.envs.backends import MakeEnv
 from mappo_unity.envs.opening import first_results
 from mappo_unity.envs.rounds import Episode
 from mappo_unity.keys import policy_name
-from mappo_unity.policies.episodes import play
+from mappo_unity.policies.episodes import Ended, play
 from mappo_unity.policies.layouts import check_two_sides
+from mappo_unity.policies.match_pairs import other_returns
 from mappo_unity.policies.policy import Policy
 from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_silence, has_snapshots
 
@@ -125,12 +128,15 @@ def play_side(
     In an environment that is used, where matches have been played before, those that the reset begins do not
     count: the ball lies where the other side has left it.
     """
-    name = own[0]
+    name, rival = own[0], next(behavior for behavior in policies if behavior not in own)
     env.reset()
     members = count_members(env, name)
+    ended = defaultdict[str, list[Ended]](list)
     # Each member of a team has an agent episode of its own in every match.
-    episodes = play(env, policies, matches * (members or 1), only=name, skip_first=is_used)[name]
-    return count(episodes, members)
+    episodes = play(
+        env, policies, matches * (members or 1), name, is_used, lambda who, row: ended[who].append(row)
+    )[name]
+    return count(episodes, members, other_returns(ended[name], ended[rival]))
 
 
 def count_members(env: BaseEnv, behavior: str) -> int | None:
@@ -152,17 +158,21 @@ def count_members(env: BaseEnv, behavior: str) -> int | None:
     return int(sizes.max()) if sizes.any() else None
 
 
-def count(episodes: list[Episode], members: int | None) -> Score:
+def count(episodes: list[Episode], members: int | None, others: Mapping[int, float] | None = None) -> Score:
     """Sum up the outcomes of matches.
 
     Args:
         episodes: in the order of their ends.
         members: of a team, each of which has an episode in a match; None: there are no teams.
+        others: the other side's returns (`other_returns`); 0 of a match that is missing there.
     """
     score = Score()
     for episode in episodes if members is None else _last_of_teams(episodes, members):
         outcome = episode.individual_return if members is None else episode.group_return
-        result = int(outcome > 0) - int(outcome < 0)
+        other = (others or {}).get(id(episode), 0.0)
+        # what is equal may have been added up in another order
+        is_draw = math.isclose(outcome, other, rel_tol=1e-6)
+        result = 0 if is_draw else int(outcome > other) - int(outcome < other)
         length = episode.length
         score += Score(int(result > 0), int(result == 0), int(result < 0), length, ((result, length),))
 
