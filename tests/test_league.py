@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from mappo_unity.policies.league.play import play_league, tasks_of
 from mappo_unity.policies.league.report import write_report
 from mappo_unity.policies.league.table import MATCHES, pairs_of
 from mappo_unity.policies.league.words import short_names
+from mappo_unity.policies.policy_files import ZOO_FOLDER
 from mappo_unity.runs.folder import write_record
 from mappo_unity.runs.lock import locked
 from mappo_unity.training.trainer import train
@@ -130,6 +132,32 @@ def test_names_are_short_and_tell_the_players_apart() -> None:
     ]
     assert short_names(["x/random", "y"]) == ["x/random", "y"]  # only the real random is called random
     assert short_names(["b", "a/b", "/run"]) == ["b", "a/b", "run"]
+    here = Path.cwd().name
+    assert short_names(["./zoo", "zoo", "random/", "random"]) == [
+        f"{here}/zoo",
+        "zoo",
+        f"{here}/random",
+        "random",
+    ]
+    assert short_names(["./zoo", "random"]) == ["zoo", "random"]
+
+
+def test_a_folder_of_ones_own_is_not_the_package_s_zoo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("zoo", "random"):
+        Path(name).mkdir()
+        shutil.copy(ZOO_FOLDER / "SoccerTwos.onnx", name)
+    shutil.copy(ZOO_FOLDER / "Goalie.onnx", "zoo")  # another digest than the other folder's
+    league = check_league(LeagueConfig(["./zoo", "zoo", "./random", "random"], env="SoccerTwos"))
+    assert [player.where for player in league.players] == [
+        str(tmp_path / "zoo"),
+        str(ZOO_FOLDER),
+        str(tmp_path / "random"),
+        "random",
+    ]
+    assert len({player.digest for player in league.players}) == len(set(league.names)) == 4
 
 
 def test_words_before_the_options_are_the_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -122,9 +122,14 @@ def begin(league: League) -> None:
 
 
 def _file(source: Source) -> str:
-    """Return the file (of ONNX files also the folder) that plays."""
+    """Return the file (of ONNX files also the folder) that plays, or the word for chance.
+
+    A path is absolute: ./zoo and ./random, as `Path` writes them, would be words again.
+    """
+    if source.kind is Kind.random:
+        return RANDOM
     is_checkpoint = source.kind in (Kind.run, Kind.checkpoint)
-    return str(choose_checkpoint(source.path, _OPTION) if is_checkpoint else source.path)
+    return os.path.abspath(choose_checkpoint(source.path, _OPTION) if is_checkpoint else source.path)
 
 
 def _check_different(words: Sequence[str], files: Sequence[str]) -> None:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from pathlib import PurePath
 
-from mappo_unity.policies.policy_files import RANDOM
+from mappo_unity.policies.policy_files import RANDOM, ZOO
 
 
 def short_names(words: Sequence[str]) -> list[str]:
@@ -15,8 +15,15 @@ def short_names(words: Sequence[str]) -> list[str]:
     Args:
         words: the players as the user named them, no two the same.
     """
-    paths = {word: PurePath(os.path.normpath(word)).parts for word in [*words, RANDOM]}
+    paths = {word: _parts(word) for word in [*words, RANDOM]}
     return [_tail(paths[word], [path for other, path in paths.items() if other != word]) for word in words]
+
+
+def _parts(word: str) -> tuple[str, ...]:
+    path = os.path.normpath(word)
+    if path != word and path in (RANDOM, ZOO):  # a folder of one's own, ./zoo
+        path = os.path.abspath(path)
+    return PurePath(path).parts
 
 
 def _tail(path: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> str:
