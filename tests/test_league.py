@@ -16,7 +16,7 @@ from mappo_unity.config.compose import compose_config, compose_plain
 from mappo_unity.config.plain_options import take_words
 from mappo_unity.config.schema import Backend, EnvConfig, LeagueConfig
 from mappo_unity.errors import ConfigError
-from mappo_unity.policies.league.checks import League, Player, check_league
+from mappo_unity.policies.league.checks import League, Player, check_league, check_unchanged, digest_of
 from mappo_unity.policies.league.play import play_league, tasks_of
 from mappo_unity.policies.league.report import write_report
 from mappo_unity.policies.league.table import MATCHES, pairs_of
@@ -120,6 +120,26 @@ def test_a_folder_belongs_to_one_league(tmp_path: Path) -> None:
         pytest.raises(ConfigError, match="is being played by another process"),
     ):
         play_all(league)
+
+
+def test_a_policy_that_is_replaced_while_the_league_plays_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "best.onnx"
+    shutil.copy(ZOO_FOLDER / "SoccerTwos.onnx", file)
+    player = Player("best", str(file), digest_of(str(file)))
+    league = League((player, *league_in(tmp_path).players), DUEL, 2, False, 0, tmp_path / "league")
+    league = replace(league, env=EnvConfig(name="SoccerTwos", num_areas=1))
+
+    def replaced(*told: object) -> None:
+        shutil.copy(ZOO_FOLDER / "Striker.onnx", file)
+
+    with pytest.raises(
+        ConfigError, match="policy best has changed since the league began: .*best.onnx is not"
+    ):
+        play_league(league, 1, replaced)
+    assert len((league.folder / MATCHES).read_text().splitlines()) == 1 + 2  # the pair before it counts
+    file.unlink()
+    with pytest.raises(ConfigError, match="policy best has changed"):
+        check_unchanged(player)
 
 
 def test_names_are_short_and_tell_the_players_apart() -> None:

@@ -93,7 +93,7 @@ def check_league(cfg: LeagueConfig, lines: Sequence[str] = ()) -> League:
     check_fit(sources, known, behaviors)
 
     names = short_names(cfg.policies)
-    players = tuple(Player(*values) for values in zip(names, files, map(_digest, files)))
+    players = tuple(Player(*values) for values in zip(names, files, map(digest_of, files)))
     league = League(
         players,
         _for_matches(config.env, cfg.matches),
@@ -119,6 +119,33 @@ def begin(league: League) -> None:
         raise ConfigError(
             f"out={league.folder} cannot be made or written ({error.strerror or error}: {error.filename})"
         ) from error
+
+
+def digest_of(file: str) -> str:
+    """Return the SHA-256 of what plays, shortened; of a folder that of its ONNX files."""
+    if file == RANDOM:
+        return RANDOM
+    path, digest = Path(file), hashlib.sha256()
+    for part in sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]:
+        digest.update(part.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def check_unchanged(player: Player) -> None:
+    """Raise ConfigError if what plays, now that it is open, is not what the league began with."""
+    if player.where == RANDOM:
+        return
+
+    try:
+        is_same = digest_of(player.where) == player.digest
+    except OSError:  # it is gone
+        is_same = False
+    if not is_same:
+        raise ConfigError(
+            f"the policy {player.name} has changed since the league began: {player.where} is not what it "
+            "was. A run that trains replaces its best checkpoint: name one that stays, or a copy, and "
+            "another folder as out"
+        )
 
 
 def _file(source: Source) -> str:
@@ -175,16 +202,6 @@ def _for_matches(env: EnvConfig, matches: int) -> EnvConfig:
     if areas is not None and env.backend is Backend.embedded:
         areas = min(areas, (matches + 1) // 2)
     return replace(env, num_areas=areas, params=params_at(env.params, {}, missing=-1))
-
-
-def _digest(file: str) -> str:
-    """Return the SHA-256 of what plays, shortened; of a folder that of its ONNX files."""
-    if file == RANDOM:
-        return RANDOM
-    path, digest = Path(file), hashlib.sha256()
-    for part in sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]:
-        digest.update(part.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def _check_folder(league: League) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 
 from mappo_unity.config.schema import EnvConfig
 from mappo_unity.errors import EnvironmentFailure
-from mappo_unity.policies.league.checks import League, Player, begin
+from mappo_unity.policies.league.checks import League, Player, begin, check_unchanged
 from mappo_unity.policies.league.table import Pair, Result, pairs_of, read_results, write_results
 from mappo_unity.runs.folder import PLAYERS
 from mappo_unity.runs.lock import locked
@@ -93,7 +93,11 @@ def tasks_of(league: League) -> list[Task]:
 
 
 def play_pair(task: Task) -> list[Result]:
-    """Play a pair's matches; return the first one's results as each side."""
+    """Play a pair's matches; return the first one's results as each side.
+
+    Raises:
+        ConfigError: a player's file is another one than at the league's beginning, or does not fit.
+    """
     import torch
 
     from mappo_unity.envs.backends import make_env_function
@@ -108,6 +112,9 @@ def play_pair(task: Task) -> list[Result]:
 
     pair = zip((task.first, task.second), seeds)
     policy, opponent = (open_policy(player.where, task.deterministic, seed) for player, seed in pair)
+    # only now: a file that is replaced while it is opened is found, too
+    for player in (task.first, task.second):
+        check_unchanged(player)
     make_env = make_env_function(task.env, task.logs)
     scores = play_matches(make_env, policy, opponent, task.matches, env_seed)
     return [
