@@ -122,6 +122,21 @@ def test_a_folder_belongs_to_one_league(tmp_path: Path) -> None:
         play_all(league)
 
 
+def test_a_league_that_is_refused_leaves_the_other_s_record_alone(tmp_path: Path) -> None:
+    """Two that begin at once both find an empty folder."""
+    one, other = league_in(tmp_path / "league"), league_in(tmp_path / "league", seed=4)
+    one.folder.mkdir()
+    with locked(one.folder), pytest.raises(ConfigError, match="is being played by another process"):
+        play_all(other)
+    assert not (one.folder / "league.json").exists()
+
+    play_all(one)
+    before = files_of(one.folder)
+    with pytest.raises(ConfigError, match="holds another league, which differs in seed"):
+        play_all(other)
+    assert files_of(one.folder) == before
+
+
 def test_a_policy_that_is_replaced_while_the_league_plays_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "best.onnx"
     shutil.copy(ZOO_FOLDER / "SoccerTwos.onnx", file)

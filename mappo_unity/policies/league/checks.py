@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from mappo_unity.policies.policy_files import RANDOM, SUFFIX, Kind, Source, choo
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.folder import find_run
 from mappo_unity.runs.json_record import record_to_resume
+from mappo_unity.runs.lock import locked
 from mappo_unity.runs.options import config_to_play
 from mappo_unity.scenes.mujoco_check import check_mujoco
 
@@ -106,18 +108,31 @@ def check_league(cfg: LeagueConfig, lines: Sequence[str] = ()) -> League:
     return league
 
 
-def begin(league: League) -> None:
-    """Make the league's folder and write what it is.
+@contextmanager
+def begun(league: League) -> Iterator[None]:
+    """Make the league's folder, hold its lock, and write what the league is.
 
     Raises:
-        ConfigError: it cannot be made or written.
+        ConfigError: it cannot be made or written, is in use, or holds another league by now.
     """
-    try:
+    with _told_as_out(league.folder):
         league.folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(league.folder / RECORD, _text(league.record()))
+
+    with locked(league.folder, f"the league in {league.folder} is being played"):
+        # once more: whoever held the lock before may have begun another league
+        _check_folder(league)
+        with _told_as_out(league.folder):
+            write_atomically(league.folder / RECORD, _text(league.record()))
+        yield
+
+
+@contextmanager
+def _told_as_out(folder: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise ConfigError(
-            f"out={league.folder} cannot be made or written ({error.strerror or error}: {error.filename})"
+            f"out={folder} cannot be made or written ({error.strerror or error}: {error.filename})"
         ) from error
 
 

@@ -23,10 +23,9 @@ import numpy as np
 
 from mappo_unity.config.schema import EnvConfig
 from mappo_unity.errors import EnvironmentFailure
-from mappo_unity.policies.league.checks import League, Player, begin, check_unchanged
+from mappo_unity.policies.league.checks import League, Player, begun, check_unchanged
 from mappo_unity.policies.league.table import Pair, Result, pairs_of, read_results, write_results
 from mappo_unity.runs.folder import PLAYERS
-from mappo_unity.runs.lock import locked
 from mappo_unity.signals import Interrupted
 
 Told = Callable[[Pair, list[Result], int, int], None]
@@ -66,8 +65,7 @@ def play_league(league: League, workers: int | None, told: Told) -> dict[Pair, l
         ConfigError: the folder cannot be written or is in use, or a policy does not fit the environment.
         EnvironmentFailure: an environment, or a process, has failed for good.
     """
-    begin(league)
-    with locked(league.folder, f"the league in {league.folder} is being played"):
+    with begun(league):
         results = read_results(league.folder)
         tasks = [task for task in tasks_of(league) if task.pair not in results]
         total = len(results) + len(tasks)
