@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import multiprocessing
+import os
 import shutil
+import signal
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +19,7 @@ from mappo_unity.config.compose import compose_config, compose_plain
 from mappo_unity.config.plain_options import take_words
 from mappo_unity.config.schema import Backend, EnvConfig, LeagueConfig
 from mappo_unity.errors import ConfigError
+from mappo_unity.policies.league import play
 from mappo_unity.policies.league.checks import League, Player, check_league, check_unchanged, digest_of
 from mappo_unity.policies.league.play import play_league, tasks_of
 from mappo_unity.policies.league.report import write_report
@@ -24,6 +28,7 @@ from mappo_unity.policies.league.words import short_names
 from mappo_unity.policies.policy_files import ZOO_FOLDER
 from mappo_unity.runs.folder import write_record
 from mappo_unity.runs.lock import locked
+from mappo_unity.signals import Interrupted
 from mappo_unity.training.trainer import train
 
 NAMES = ("a <b>", "b & c", "random")
@@ -85,6 +90,28 @@ def test_a_process_that_fails_says_why_and_leaves_what_was_played(tmp_path: Path
     gone = replace(league, players=(*league.players[:2], Player("random", "gone.onnx", "")))
     with pytest.raises(ConfigError, match="run=gone.onnx does not exist"):
         play_league(gone, 2, lambda *args: None)
+
+
+def test_processes_that_wait_for_a_pair_end_without_a_word(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(KeyboardInterrupt), play._processes(1) as pool:
+        pid = pool.submit(os.getpid).result()
+        (child,) = [child for child in multiprocessing.active_children() if child.pid == pid]
+        child.terminate()
+        child.join(60)
+        raise KeyboardInterrupt
+    assert child.exitcode == 128 + signal.SIGTERM and capfd.readouterr().err == ""
+
+
+def test_a_pair_that_is_told_to_end_closes_what_is_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    def told_twice(task: play.Task) -> list:
+        with pytest.raises(Interrupted):
+            play._stop(signal.SIGTERM, None)
+        play._stop(signal.SIGTERM, None)
+        return []
+
+    monkeypatch.setattr(play, "_stopped", False)
+    monkeypatch.setattr(play, "_play", told_twice)
+    assert play.play_pair(None) == [] and play._stopped  # type: ignore[arg-type]
 
 
 def test_what_is_written(tmp_path: Path) -> None:

@@ -95,7 +95,17 @@ def play_pair(task: Task) -> list[Result]:
 
     Raises:
         ConfigError: a player's file is another one than at the league's beginning, or does not fit.
+        Interrupted: the process was told to end.
     """
+    global _is_playing
+    _is_playing = True
+    try:
+        return _play(task)
+    finally:
+        _is_playing = False
+
+
+def _play(task: Task) -> list[Result]:
     import torch
 
     from mappo_unity.envs.backends import make_env_function
@@ -157,7 +167,8 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
         pool.shutdown()
 
 
-_stopped = False  # whether this process has been told to end
+_is_playing = False  # whether this process plays a pair: there is something to close
+_stopped = False  # whether it has been told to end meanwhile
 
 
 def _begin_process() -> None:
@@ -174,6 +185,10 @@ def _begin_process() -> None:
 
 
 def _stop(number: int, frame: Any) -> None:
+    # between pairs nobody would catch an exception: its traceback would be printed
+    if not _is_playing:
+        os._exit(128 + number)
+
     # raised once, so that players are closed; a second one must not break that off
     global _stopped
     if not _stopped:
