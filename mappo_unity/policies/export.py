@@ -24,8 +24,10 @@ from mappo_unity.policies.onnx_check import compare
 from mappo_unity.policies.onnx_graph import build_model
 from mappo_unity.policies.onnx_policy import SUFFIX, OnnxPolicy, file_name
 from mappo_unity.policies.policy import CheckpointPolicy
+from mappo_unity.policies.policy_files import choose_checkpoint
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.atomic import write_atomically
+from mappo_unity.runs.checkpoint_file import POOL
 from mappo_unity.signals import interrupts_wait
 
 SAMPLE_ROWS = 64  # observations that a checkpoint keeps of each policy
@@ -69,12 +71,12 @@ def export_checkpoint(path: Path, out: Path | None = None) -> list[Exported]:
         data = build_model(actor[0].module, layout["sensors"], name, metadata).SerializeToString()
 
         # What cannot be compared is refused, before anything is written.
-        sample = state.get("samples", {}).get(name, {})
+        sample = _samples(path, state).get(name, {})
         rows = len(next(iter(sample.values()), ()))
         if not rows:
             raise ExportError(
                 f"checkpoint {path} holds no observations of {name!r} to compare an export with; "
-                "let its run go on for an iteration (mappo-train resume=...), which writes one that does"
+                f"{_how_to_get_samples(path)}"
             )
 
         error = compare(data, actor, layout["sensors"], sample)
@@ -85,6 +87,23 @@ def export_checkpoint(path: Path, out: Path | None = None) -> list[Exported]:
             _write(exported.path, data)
 
     return [exported for _, exported in written]
+
+
+def _samples(path: Path, state: dict[str, Any]) -> dict[str, dict[str, torch.Tensor]]:
+    """Return observations that a checkpoint's policies acted on; for a snapshot of self-play its run's."""
+    if path.parent.name == POOL:
+        try:
+            state = checkpoint.load(choose_checkpoint(path.parent.parent))
+        except ConfigError:  # a copy without its run
+            return {}
+    samples: dict[str, dict[str, torch.Tensor]] = state.get("samples", {})
+    return samples
+
+
+def _how_to_get_samples(path: Path) -> str:
+    if path.parent.name == POOL:
+        return f"it is a snapshot of self-play, and no checkpoint of its run {path.parent.parent} holds any"
+    return "let its run go on for an iteration (mappo-train resume=...), which writes one that does"
 
 
 def sample_inputs(entries: TensorDictBase, in_keys: Sequence[str]) -> dict[str, torch.Tensor]:

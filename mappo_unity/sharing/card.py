@@ -62,7 +62,7 @@ class Training:
     seed: int
     backend: str
     areas: int | None  # None: as many as the environment has
-    wall_s: float
+    wall_s: float | None  # None: not told, of a snapshot of self-play
     versions: Mapping[str, str]
 
 
@@ -238,7 +238,7 @@ def _training(facts: Facts) -> str:
     rows = {
         "environment": f"{facts.env}, backend {training.backend}{areas}",
         "agent steps": "unknown" if facts.agent_steps is None else f"{facts.agent_steps:,}",
-        "wall time": f"{training.wall_s:,.0f} s",
+        "wall time": "unknown" if training.wall_s is None else f"{training.wall_s:,.0f} s",
         "seed": str(training.seed),
         "versions": versions,
     }

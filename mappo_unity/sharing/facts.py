@@ -215,6 +215,6 @@ def _training(trained: Trained, config: Config | None) -> Training | None:
         seed=config.seed,
         backend=config.env.backend.value,
         areas=config.env.num_areas,
-        wall_s=trained.state["wall_s"],
+        wall_s=trained.state.get("wall_s"),
         versions={name: str(versions[name]) for name in _VERSIONS if versions.get(name)},
     )
