@@ -8,6 +8,7 @@ from fakes import Record, ScriptedEnv
 from test_matches import Always
 
 from mappo_unity.envs.rounds import Episode
+from mappo_unity.errors import ConfigError
 from mappo_unity.policies.episodes import Ended, play
 from mappo_unity.policies.match_pairs import other_returns
 from mappo_unity.policies.matches import play_matches
@@ -43,6 +44,26 @@ def results(shift: float, policy: int, opponent: int) -> dict[str, tuple[tuple[i
 def test_what_both_sides_earn_alike_decides_no_match(shift: float) -> None:
     for choices, wanted in {(0, 1): -1, (1, 0): 1, (0, 2): 1, (2, 0): -1, (1, 1): 0}.items():
         assert results(shift, *choices) == dict.fromkeys(matrix_game.SIDES, ((wanted, 1),) * 6)
+
+
+class Late(matrix_game.MatrixGame):
+    """A game that shows a third behavior after its first step."""
+
+    def step(self):
+        super().step()
+        self.specs["Late?team=1"] = self.specs[matrix_game.SIDES[1]]
+
+    def get_steps(self, behavior_name):
+        return super().get_steps(
+            behavior_name if behavior_name in matrix_game.SIDES else matrix_game.SIDES[1]
+        )
+
+
+def test_a_behavior_that_appears_during_matches_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match="'Late.team=1' appeared after the start, when there were .'Rps.team=0'"
+    ):
+        play_matches(Late, Always(0), Always(1), 4, seed=0)
 
 
 def end(agent: int, began: int, ended: int, value: float, group: int = 0) -> Ended:

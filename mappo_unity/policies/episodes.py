@@ -13,7 +13,12 @@ from mappo_unity.envs.rounds import Episode
 from mappo_unity.errors import EnvironmentFailure
 from mappo_unity.policies.policy import Policy
 from mappo_unity.scenes.contract.records import RecordCheck
-from mappo_unity.scenes.contract.rules import MAX_SILENT_STEPS, check_silence, check_specs
+from mappo_unity.scenes.contract.rules import (
+    MAX_SILENT_STEPS,
+    EnvironmentDataError,
+    check_silence,
+    check_specs,
+)
 from mappo_unity.scenes.contract.statistics import pop_statistics
 
 MAX_ENV_STEPS = 5_000_000
@@ -65,7 +70,8 @@ def play(
 
     env.reset()
     check_specs(env.behavior_specs)
-    for counts.step in range(MAX_ENV_STEPS):
+    for step in range(MAX_ENV_STEPS):
+        counts.step = step
         silent = 0 if _act(env, policy, checks, running, counts) else silent + 1
 
         names = [only] if only else list(env.behavior_specs)
@@ -96,13 +102,24 @@ def _act(
         _forget_crashed(env, name, running, counts)
         _end_episodes(name, terminal, running, counts)
 
-        actor = policy[name] if isinstance(policy, dict) else policy
+        actor = _actor(policy, name)
         _tell(actor, name, decision, terminal, running)
         _go_on(name, decision, running, counts)
         if len(decision):
             asked = True
             env.set_actions(name, actor.act(name, decision, env.behavior_specs[name]))
     return asked
+
+
+def _actor(policy: Policy | dict[str, Policy], behavior: str) -> Policy:
+    if not isinstance(policy, dict):
+        return policy
+    if behavior not in policy:
+        raise EnvironmentDataError(
+            f"behavior {behavior!r} appeared after the start, when there were {list(policy)}: neither side "
+            "plays it; let every behavior have an active agent at first"
+        )
+    return policy[behavior]
 
 
 def _endless(env: BaseEnv, episodes: int, counts: _Counts) -> EnvironmentFailure:
