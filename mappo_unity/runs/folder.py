@@ -23,7 +23,7 @@ from mappo_unity.config.schema import Config
 from mappo_unity.config.user_modules import folder_of
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
-from mappo_unity.runs.checkpoint_file import checkpoints_in, newest_good
+from mappo_unity.runs.checkpoint_file import POOL, checkpoints_in, newest_good
 from mappo_unity.runs.json_record import read_json
 from mappo_unity.runs.lock import LOCK, locked
 from mappo_unity.runs.versions import read_versions
@@ -75,7 +75,7 @@ def create_folder(wanted: Path, exact: bool = False) -> NewFolder:
 def discard_folder(folder: NewFolder, reason: BaseException | None = None) -> None:
     """Remove the folder of a run that completed no iteration, unless it holds more than the record.
 
-    Logs without a row are no more, nor are players' logs, unless `reason`, which the user is told, names one.
+    Logs without a row, and a pool, are no more, nor are players' logs, unless the `reason` told names one.
     """
     logs = [path for path in (folder.path / PLAYERS, folder.path / LOGS) if path.is_dir()]
     if any(str(path) in str(reason) for path in logs) or _other_files(folder.path):
@@ -122,12 +122,12 @@ class Record:
 def read_record(folder: Path) -> Record:
     """Return the record of a run, to be put back by `restore_record`."""
     files = {name: (folder / name).read_bytes() for name in RECORD if (folder / name).is_file()}
-    return Record(files, _state_of(folder.rglob("*.pt")))
+    return Record(files, _state_of(checkpoints_in(folder)))
 
 
 def restore_record(folder: Path, record: Record) -> None:
     """Put the record back, unless a checkpoint was written: then what it was trained with stays written."""
-    if _state_of(folder.rglob("*.pt")) != record.checkpoints:
+    if not _state_of(checkpoints_in(folder)).items() <= record.checkpoints.items():
         return
 
     for name in RECORD:
@@ -279,10 +279,10 @@ def _clear_unbegun(folder: Path) -> bool:
 
 
 def _other_files(folder: Path) -> dict[Path, tuple[int, int]]:
-    """Return what a run's folder holds beside its record and the logs of a run without an iteration."""
+    """Return what a run's folder holds beside its record, and logs and pool of one without an iteration."""
     has_rows = bool(_line_after_first(folder / METRICS))
     no_work = (*RECORD, LOCK) if has_rows else (*RECORD, LOCK, METRICS)
-    no_folders = (PLAYERS, LOGS) if has_rows else (PLAYERS, LOGS, EVENTS)
+    no_folders = (PLAYERS, LOGS) if has_rows else (PLAYERS, LOGS, EVENTS, POOL)
 
     found = (path for path in folder.rglob("*") if path.is_file() and path.name not in no_work)
     return _state_of(path for path in found if path.relative_to(folder).parts[0] not in no_folders)

@@ -131,10 +131,13 @@ def _resume(lines: list[str], path: Path, warn: Warn, show: _Show) -> Launched:
         record = runs.read_record(folder)
         runs.write_record(folder, config, lines)
         try:
-            return Launched(folder, _train(config, folder, checkpoint, show))
+            outcome = _train(config, folder, checkpoint, show)
         except BaseException:
             runs.restore_record(folder, record)
             raise
+        if outcome.last_checkpoint == checkpoint:  # interrupted before an iteration was complete
+            runs.restore_record(folder, record)
+        return Launched(folder, outcome)
 
 
 def _newest_checkpoint(config: Config, source: Path, warn: Warn) -> tuple[Path, str | None]:

@@ -1,0 +1,59 @@
+"""Runs that end before an iteration, or in what follows their last one: what they leave, and resuming them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_self_play import GAME
+
+from mappo_unity.cli import train_main
+from mappo_unity.runs.folder import CONFIG
+from mappo_unity.training import trainer
+from mappo_unity.training.setup import TrainingSetup
+
+BATCH = 64
+LINES = [*GAME, "hydra.run.dir=run", f"max_steps={3 * BATCH}", "env.params.games=8"]
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def interrupt(*arguments: Any, **options: Any) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("how", ["interrupted", "killed"])
+def test_self_play_without_an_iteration_can_be_started_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], how: str
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingSetup, "learn", interrupt)
+        if how == "killed":
+            patch.setattr("mappo_unity.runs.folder.discard_folder", lambda *arguments: None)
+        assert train_main(LINES) == 130
+    assert Path("run/pool").exists() == Path("run").exists() == (how == "killed")
+
+    assert train_main(LINES) == 0, capsys.readouterr().err
+    # the pool of a run that has learnt is no leftover
+    assert train_main(LINES) == 2 and "is not empty" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("pool", ["as before", "begun anew"])
+def test_options_of_a_resume_without_an_iteration_do_not_last(
+    monkeypatch: pytest.MonkeyPatch, pool: str
+) -> None:
+    assert train_main([*LINES, *(["self_play.save_steps=null"] if pool == "begun anew" else [])]) == 0
+    before = Path("run", CONFIG).read_bytes()
+
+    resume = ["resume=run", "max_steps=1000", "ppo.lr=0.5", "self_play.save_steps=64"]
+    with monkeypatch.context() as patch:  # a signal that comes before the first iteration
+        patch.setattr(trainer, "_status", lambda *arguments: "interrupted")
+        assert train_main(resume) == 0
+    assert Path("run", CONFIG).read_bytes() == before
+
+    assert train_main(["resume=run", "max_steps=256", "ppo.lr=0.5"]) == 0
+    assert Path("run", CONFIG).read_bytes() != before
