@@ -1,4 +1,4 @@
-"""Runs that end before an iteration, or in what follows their last one: what they leave, and resuming them."""
+"""Runs that end before an iteration, or in what follows their last one: what they leave, how they resume."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import pytest
 from test_self_play import GAME
 
 from mappo_unity.cli import train_main
+from mappo_unity.errors import ConfigError
+from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import CONFIG
 from mappo_unity.training import trainer
 from mappo_unity.training.setup import TrainingSetup
@@ -57,3 +59,25 @@ def test_options_of_a_resume_without_an_iteration_do_not_last(
 
     assert train_main(["resume=run", "max_steps=256", "ppo.lr=0.5"]) == 0
     assert Path("run", CONFIG).read_bytes() != before
+
+
+def test_what_the_system_refuses_a_rescue_is_said_beside_the_reason(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    learn = TrainingSetup.learn
+    calls = []
+
+    def refused(*arguments: Any) -> None:
+        raise PermissionError("the folder belongs to somebody else")
+
+    def broken(setup: TrainingSetup, *arguments: Any, **options: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 3:
+            monkeypatch.setattr(checkpoint, "save_in", refused)
+            raise ConfigError("the first reason")
+        return learn(setup, *arguments, **options)
+
+    monkeypatch.setattr(TrainingSetup, "learn", broken)
+    assert train_main([*LINES, "checkpoint_interval=1000000"]) == 2
+    out, errors = capfd.readouterr()
+    assert "the first reason" in errors and "somebody else" in out

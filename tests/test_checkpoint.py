@@ -143,3 +143,34 @@ def test_a_full_disk_leaves_the_previous_checkpoint(tmp_path, monkeypatch, call)
     names = sorted(p.name for p in (tmp_path / "checkpoints").iterdir())
     assert names == ["best.pt", "step_000000000100.pt"]
     assert newest_good(tmp_path)[0].name == "step_000000000100.pt"
+
+
+@pytest.fixture
+def unremovable(monkeypatch):
+    def unlink(path, missing_ok=False):
+        if path.exists():
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(checkpoint.Path, "unlink", unlink)
+
+
+def test_an_old_checkpoint_that_cannot_be_removed_ends_no_run(tmp_path, unremovable):
+    for steps in (100, 200, 300):
+        save_in(tmp_path, steps, STATE, keep=1, best=True)
+    names = [path.name for path in checkpoint.checkpoints_in(tmp_path)]
+    assert names == [f"step_{steps:012d}.pt" for steps in (100, 200, 300)]
+
+
+def test_a_best_checkpoint_that_cannot_be_made_is_told(tmp_path, monkeypatch):
+    save_in(tmp_path, 100, STATE, keep=1, best=True)
+    replace = os.replace
+
+    def refuse(source, target):
+        if os.path.basename(target) == "best.pt":
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(target))
+        replace(source, target)
+
+    monkeypatch.setattr(checkpoint.os, "replace", refuse)
+    with pytest.raises(CheckpointError, match="step_0+200.pt was written, but best.pt could not be made"):
+        save_in(tmp_path, 200, STATE, keep=1, best=True)
+    assert newest_good(tmp_path)[0].name == "step_000000000200.pt"

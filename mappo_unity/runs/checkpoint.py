@@ -14,6 +14,7 @@ import errno
 import io
 import os
 import shutil
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,11 @@ def save(path: Path, state: dict[str, Any]) -> None:
 
 
 def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, best: bool) -> Path:
-    """Write a run's checkpoint, make it the best one if it is, and drop all but the newest ``keep``."""
+    """Write a run's checkpoint, make it the best one if it is, and drop all but the newest ``keep``.
+
+    Raises:
+        CheckpointError: it cannot be written, or not become the best one; those before it stay.
+    """
     if not folder.is_dir():
         raise CheckpointError(
             f"the run folder {folder} was removed or moved while the run was training: "
@@ -79,21 +84,32 @@ def save_in(folder: Path, agent_steps: int, state: dict[str, Any], keep: int, be
     path = folder / FOLDER / NAME.format(agent_steps)
     save(path, state)
 
-    # A second name for the same file, moved into place: at no moment there is none.
     if best:
-        link = path.with_name(f".{BEST}.{os.getpid()}.tmp")
-        link.unlink(missing_ok=True)
         try:
-            os.link(path, link)
-        except OSError:  # a file system without hard links
-            save(path.with_name(BEST), state)
-        else:
-            os.replace(link, path.with_name(BEST))
+            _make_best(path, state)
+        except OSError as error:
+            raise CheckpointError(
+                f"checkpoint {path} was written, but {BEST} could not be made of it: {error}; the one before "
+                "it stays"
+            ) from error
 
     for old in checkpoints_in(folder)[:-keep]:
-        old.unlink(missing_ok=True)
+        with suppress(OSError):  # one that cannot be removed costs space, and no run
+            old.unlink(missing_ok=True)
 
     return path
+
+
+def _make_best(path: Path, state: dict[str, Any]) -> None:
+    # A second name for the same file, moved into place: at no moment there is none.
+    link = path.with_name(f".{BEST}.{os.getpid()}.tmp")
+    link.unlink(missing_ok=True)
+    try:
+        os.link(path, link)
+    except OSError:  # a file system without hard links
+        save(path.with_name(BEST), state)
+    else:
+        os.replace(link, path.with_name(BEST))
 
 
 def set_aside_later(folder: Path, resumed: Path, agent_steps: int) -> list[str]:

@@ -101,7 +101,7 @@ class CheckpointSaver:
         """Save the last complete iteration before an error or a second signal ends the run; say where."""
         try:
             self.save(is_regular=False)
-        except ConfigError as error:
+        except (ConfigError, OSError) as error:  # which must not hide the one that ends the run
             say(str(error))
             return
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -134,7 +135,8 @@ class Pool:
                 continue
             if best is not None and snapshot.steps <= best < dropped_at:
                 continue
-            (self._folder / POOL / snapshot.file).unlink(missing_ok=True)
+            with suppress(OSError):  # one that cannot be removed costs space, and no run
+                (self._folder / POOL / snapshot.file).unlink(missing_ok=True)
             self._snapshots.remove(snapshot)
 
     def _best_steps(self) -> int | None:
