@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mappo_unity.config.option_table import show_value
-from mappo_unity.config.schema import ModelConfig
+from mappo_unity.config.schema import ModelConfig, ValueNormKind
 from mappo_unity.learning.ppo import PolicyLearner
 from mappo_unity.policies.layouts import describe_spec, same_layout
 from mappo_unity.policies.policy import model_from_saved
@@ -58,8 +58,28 @@ def _differences(option: str, there: Any, here: Any) -> list[str]:
     return [f"{option}={show_value(there)} there, {show_value(here)} here"] if there != here else []
 
 
-def check_streams(path: Path, saved: dict[str, Any], learners: dict[str, PolicyLearner]) -> None:
-    """Refuse a checkpoint that has other reward streams, or a stream with another model, saying which."""
+def check_learners(path: Path, saved: dict[str, Any], learners: dict[str, PolicyLearner]) -> None:
+    """Refuse a checkpoint of other reward streams or models of them, or of values in another scale."""
+    _check_streams(path, saved, learners)
+    for name, learner in learners.items():
+        _check_value_scale(path, name, saved[name], learner.cfg.normalize_values)
+
+
+def _check_value_scale(path: Path, name: str, saved: dict[str, Any], here: ValueNormKind) -> None:
+    """Refuse a critic whose outputs would be read in another scale than it learnt them in."""
+    is_normalized = float(saved["value_norm"]["debias"]) > 0
+    has_learnt = int(saved.get("updates", 0)) > 0  # else both are as they were made
+    # PopArt rescales a critic that learnt without, and takes up that of `running`
+    misread = here is ValueNormKind.none if is_normalized else has_learnt and here is ValueNormKind.running
+    if misread:
+        there, others = ("popart or running",) * 2 if is_normalized else ("none", "none or popart")
+        raise CheckpointError(
+            f"checkpoint {path} holds a critic of {name} that learnt with ppo.normalize_values={there}, and "
+            f"ppo.normalize_values={here.name} would misread its values; with resume it can be {others}"
+        )
+
+
+def _check_streams(path: Path, saved: dict[str, Any], learners: dict[str, PolicyLearner]) -> None:
     for name, learner in learners.items():
         there = set(saved[name].get("rewards", {}))
         here = {stream.name for stream in learner.rewards.intrinsic}

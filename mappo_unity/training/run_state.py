@@ -26,7 +26,7 @@ from mappo_unity.training.episode_stats import RecentEpisodes
 from mappo_unity.training.match_series import MatchSeries
 from mappo_unity.training.resume_check import (
     check_compatible,
-    check_streams,
+    check_learners,
     check_workers,
     describe_models,
     describe_policies,
@@ -228,7 +228,7 @@ class RunState:
         """
         state = checkpoint.load(path)
         check_compatible(path, state, self.cfg.env.name, self._layout(), self._models())
-        check_streams(path, state["learners"], self.setup.learners)
+        check_learners(path, state["learners"], self.setup.learners)
         if guessed_otherwise(state["layout"], self._layout()):
             self.setup.guess_channels()
 
