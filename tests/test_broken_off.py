@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from test_learn import BALL, SMALL
 from test_self_play import GAME
 
-from mappo_unity.cli import train_main
+from mappo_unity.cli import learn_main, train_main
 from mappo_unity.errors import ConfigError
+from mappo_unity.policies.onnx_policy import OnnxPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import CONFIG
+from mappo_unity.signals import DUPLICATE_SIGNAL_S
 from mappo_unity.training import trainer
 from mappo_unity.training.setup import TrainingSetup
 
@@ -81,3 +87,76 @@ def test_what_the_system_refuses_a_rescue_is_said_beside_the_reason(
     assert train_main([*LINES, "checkpoint_interval=1000000"]) == 2
     out, errors = capfd.readouterr()
     assert "the first reason" in errors and "somebody else" in out
+
+
+# --- mappo-learn
+
+
+RUN = Path("results", "first")
+LEARN = ["my.yaml", "--run-id=first", "--seed=5", *SMALL, "checkpoint_interval=1000000"]
+RESUME = ["my.yaml", "--run-id=first", "--resume", *SMALL[1:], "checkpoint_interval=1000000"]
+
+
+def stop_at_once(patch: pytest.MonkeyPatch, iteration: int) -> None:
+    """Let Ctrl-C come twice while this iteration is learnt, counted from the start of the process."""
+    learn = TrainingSetup.learn
+    calls = []
+
+    def interrupted(setup: TrainingSetup, *arguments: Any, **options: Any) -> Any:
+        calls.append(1)
+        if len(calls) == iteration:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1.1 * DUPLICATE_SIGNAL_S)
+            os.kill(os.getpid(), signal.SIGINT)
+        return learn(setup, *arguments, **options)
+
+    patch.setattr(TrainingSetup, "learn", interrupted)
+
+
+def published_steps() -> int | None:
+    return OnnxPolicy(RUN / "3DBall.onnx", deterministic=True).agent_steps
+
+
+def test_a_run_that_is_stopped_at_once_publishes_its_last_complete_iteration(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("my.yaml").write_text(BALL)
+    with monkeypatch.context() as patch:
+        stop_at_once(patch, iteration=3)
+        assert learn_main([*LEARN, "max_steps=2400"]) == 130
+    assert f"policy: {RUN / '3DBall.onnx'}" in capsys.readouterr().out
+    assert published_steps() == 480 and (RUN / "3DBall" / "3DBall-480.onnx").is_file()
+
+    with monkeypatch.context() as patch:
+        stop_at_once(patch, iteration=2)
+        assert learn_main([*RESUME, "max_steps=2400"]) == 130
+    assert published_steps() == 720
+
+    # nothing was trained: what is there stays
+    status = (RUN / "run_logs" / "training_status.json").read_bytes()
+    with monkeypatch.context() as patch:
+        stop_at_once(patch, iteration=1)
+        assert learn_main([*RESUME, "max_steps=2400"]) == 130
+    assert (RUN / "run_logs" / "training_status.json").read_bytes() == status and published_steps() == 720
+
+
+def test_a_policy_that_cannot_be_exported_is_not_replaced_by_an_older_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("my.yaml").write_text(BALL)
+    assert learn_main([*LEARN, "max_steps=240"]) == 0
+    status = (RUN / "run_logs" / "training_status.json").read_bytes()
+    capsys.readouterr()
+
+    def fail(*arguments: Any) -> None:
+        raise ConfigError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mappo_unity.policies.export.export_checkpoint", fail)
+        stop_at_once(patch, iteration=2)
+        assert learn_main([*RESUME, "max_steps=2400"]) == 130
+    out, errors = capsys.readouterr()
+    assert "the disk is full" in out and "policy:" not in out
+    assert f"step_{480:012d}.pt was written: {RUN / '3DBall.onnx'} is older" in errors
+    assert not (RUN / "3DBall" / "3DBall-480.onnx").exists() and published_steps() == 240
+    assert (RUN / "run_logs" / "training_status.json").read_bytes() == status

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import random
 import re
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -244,14 +246,12 @@ def _launch(settings: Settings, lines: list[str], folder: Path) -> int:
     outcome = launched.outcome
     if outcome is None:
         print(launched.message)
-        if launched.last_checkpoint is not None:
-            _say_published(results.publish_late(folder, launched.last_checkpoint))
+        _publish(folder, launched.last_checkpoint)
         return 0
 
     steps = outcome.agent_steps
-    written = results.publish(folder, outcome.last_checkpoint, policies, outcome.return_mean, steps)
     print(f"finished: {steps:,} agent steps in {outcome.wall_s:.1f} s, mean return {outcome.return_mean:.4g}")
-    _say_published(written)
+    _publish(folder, outcome.last_checkpoint, policies, outcome.return_mean)
     print(f"curves: tensorboard --logdir {folder.parent}", flush=True)
     if outcome.signal is None:
         return _MOST_ROLLED_BACK if outcome.status == "diverged" else 0
@@ -260,7 +260,27 @@ def _launch(settings: Settings, lines: list[str], folder: Path) -> int:
     return 128 + outcome.signal
 
 
-def _say_published(written: list[Path]) -> None:
+def _publish(folder: Path, last: Path | None, policies: Sequence[str] = (), mean: float = math.nan) -> None:
+    """Put the last checkpoint's ONNX files where ML-Agents has them; say which, and which older ones stay.
+
+    Without `policies` nothing was trained, and what is published already is left alone.
+    """
+    from mappo_unity.policies.export import RunExports
+    from mappo_unity.runs import results
+    from mappo_unity.runs.checkpoint_file import step_of
+
+    if last is None:
+        return
+    if RunExports(folder, print).is_behind(step_of(last)):
+        for path in (folder / f"{policy}.onnx" for policy in policies):
+            if path.is_file():
+                print(f"mappo-learn: no ONNX file of {last} was written: {path} is older", file=sys.stderr)
+        return
+
+    if policies:
+        written = results.publish(folder, last, policies, mean, step_of(last))
+    else:
+        written = results.publish_late(folder, last)
     for path in written:
         print(f"policy: {path}")
 

@@ -154,6 +154,9 @@ def publish(
         }
         status[policy] = {"checkpoints": [entry], "final_checkpoint": entry | {"file_path": str(newest)}}
 
+    if not status:  # what an earlier end of the run wrote stays
+        return []
+
     (folder / LOGS).mkdir(exist_ok=True)
     text = json.dumps({**status, "metadata": {"trainer": "mappo-unity"}}, indent=2)
     write_atomically(folder / LOGS / "training_status.json", f"{text}\n".encode())

@@ -94,6 +94,10 @@ class CheckpointSaver:
         """Save what is not saved yet, and export the best and the last checkpoint."""
         # a run that is interrupted here goes on in its rhythm when it is resumed
         self.save(is_regular=False)
+        self.export()
+
+    def export(self) -> None:
+        """Export the best and the last checkpoint, which are written."""
         if self._exports is not None:
             self._exports.finish(self.last)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rich.console import Console
@@ -114,9 +114,11 @@ def _iterate_and_save(
     except BaseException as error:
         with stop.ignored():
             saver.rescue(log.message_if_possible)
-        if not isinstance(error, Interrupted) or saver.last is None:
-            raise  # an interrupted run has an outcome only where it can be resumed
-        return INTERRUPTED
+            if isinstance(error, Interrupted) and saver.last is not None:
+                with suppress(OSError):  # nobody may be left to tell what went wrong
+                    saver.export()  # last: a scheduler that kills meanwhile costs these files alone
+                return INTERRUPTED
+        raise  # an interrupted run has an outcome only where it can be resumed
     return status
 
 
