@@ -17,8 +17,8 @@ from mappo_unity.errors import ConfigError
 from mappo_unity.policies.onnx_policy import OnnxPolicy
 from mappo_unity.runs import checkpoint
 from mappo_unity.runs.folder import CONFIG
-from mappo_unity.signals import DUPLICATE_SIGNAL_S
-from mappo_unity.training import trainer
+from mappo_unity.signals import DUPLICATE_SIGNAL_S, Interrupted
+from mappo_unity.training import match_series, trainer
 from mappo_unity.training.setup import TrainingSetup
 
 BATCH = 64
@@ -87,6 +87,59 @@ def test_what_the_system_refuses_a_rescue_is_said_beside_the_reason(
     assert train_main([*LINES, "checkpoint_interval=1000000"]) == 2
     out, errors = capfd.readouterr()
     assert "the first reason" in errors and "somebody else" in out
+
+
+# --- the last series of matches
+
+
+@pytest.mark.parametrize("ends", ["interrupted", "failed"])
+def test_the_last_series_of_matches_is_played_by_resuming(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], ends: str
+) -> None:
+    lines = [*LINES, f"matches.interval={2 * BATCH}", "matches.count=4", "matches.opponents=0"]
+    assert train_main([*lines, "hydra.run.dir=whole"]) == 0
+    play, calls = match_series.play_matches, []
+
+    def broken_off(*arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 2:
+            raise Interrupted(signal.SIGINT) if ends == "interrupted" else ConfigError("the player ended")
+        return play(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(match_series, "play_matches", broken_off)
+        assert train_main(lines) == (0 if ends == "interrupted" else 2)
+    assert newest("run")["matches"]["missing"]
+
+    rows = Path("run", "metrics.csv").read_text()
+    capfd.readouterr()
+    assert train_main(["resume=run"]) == 0
+    assert f"{newest('run')['agent_steps']} steps: of 4 matches" in capfd.readouterr().out
+    assert Path("run", "metrics.csv").read_text() == rows  # no iteration of its own
+    for part in ("matches", "agent_steps", "iteration", "best_score"):
+        assert newest("run")[part] == newest("whole")[part]
+    assert (
+        checkpoint.load(Path("run", "checkpoints", "best.pt"))["iteration"]
+        == (checkpoint.load(Path("whole", "checkpoints", "best.pt"))["iteration"])
+    )
+
+    assert train_main(["resume=run"]) == 0
+    assert "nothing to train, and nothing was changed" in capfd.readouterr().out
+
+
+def test_a_last_series_that_is_no_longer_wanted_is_not_played(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(match_series, "play_matches", interrupt)
+        assert train_main([*LINES, "matches.interval=1000"]) == 130
+    assert newest("run")["matches"]["missing"]
+    assert train_main(["resume=run", "matches.interval=null"]) == 0
+    assert "nothing to train, and nothing was changed" in capfd.readouterr().out
+
+
+def newest(run: str) -> dict[str, Any]:
+    return checkpoint.load(checkpoint.newest_good(Path(run))[0])
 
 
 # --- mappo-learn

@@ -33,6 +33,7 @@ from mappo_unity.policies.policy import ActorPolicy, Policy, RandomPolicy
 from mappo_unity.policies.policy_files import RANDOM
 from mappo_unity.runs.folder import PLAYERS
 
+MISSING = "missing"  # in the state of a checkpoint that was kept before its series was played
 POOLED = 4  # series, the newest ones, that a rating against random alone is taken from
 
 
@@ -46,7 +47,8 @@ class MatchSeries:
 
     Attributes: `two_sided`, whether the environment has two sides; `league`, whom the series made players and
     their ratings; `pool`, of each of the newest four series against random, the oldest first: its points, a
-    win counted 1 and a draw 1/2, and its matches; `said`, a line about the last one.
+    win counted 1 and a draw 1/2, and its matches; `said`, a line about the last one; `is_missing`, whether
+    the one that was due at the checkpoint that is resumed was not played to its end.
 
     Raises:
         ConfigError: series are wanted, but there are not two sides.
@@ -59,6 +61,7 @@ class MatchSeries:
         self.league = GrowingLeague()
         self.pool: list[tuple[float, int]] = []
         self.said = ""
+        self.is_missing = False
 
         self.two_sided = len(sides_of(names)) == 2
         if cfg.matches.interval is not None and not self.two_sided:
@@ -146,6 +149,7 @@ class MatchSeries:
                 before any series.
         """
         self._played_at, count = state["played_at"], self._cfg.matches.count
+        self.is_missing = is_missing(self._cfg, state)
         self.forget()
         if "pool" in state:
             self.pool = [(float(points), int(matches)) for points, matches in state["pool"]]
@@ -194,6 +198,16 @@ class MatchSeries:
     def _interval_is_over(self, agent_steps: int) -> bool:
         interval = self._cfg.matches.interval
         return interval is not None and agent_steps - self._played_at >= interval
+
+
+def is_missing(cfg: Config, state: Mapping[str, Any]) -> bool:
+    """Return whether a series is wanted that was due at a checkpoint, and was not played to its end.
+
+    Args:
+        cfg: the run's options.
+        state: what the checkpoint has of matches; that of an older version does not tell.
+    """
+    return cfg.matches.interval is not None and bool(state.get(MISSING, False))
 
 
 def _words(score: Score) -> str:

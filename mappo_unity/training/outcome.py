@@ -8,6 +8,7 @@ from pathlib import Path
 from mappo_unity.config.schema import Config
 from mappo_unity.runs import checkpoint
 from mappo_unity.training.episode_stats import RecentEpisodes
+from mappo_unity.training.match_series import is_missing
 
 FINISHED = "finished"  # max_steps are done
 SOLVED = "solved"  # stop_at_return is reached
@@ -39,6 +40,8 @@ def why_over(cfg: Config, path: Path) -> str | None:
     """
     state = checkpoint.load(path)
     if state["agent_steps"] >= cfg.max_steps:
+        if is_missing(cfg, state["matches"]):  # the last series of matches is played, and no iteration
+            return None
         return (
             f"it has done {state['agent_steps']:,} of max_steps={cfg.max_steps:,} steps; "
             "max_steps=N with a larger N trains on"

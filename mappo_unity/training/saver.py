@@ -11,6 +11,7 @@ from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.policies.export import RunExports
 from mappo_unity.runs import checkpoint
+from mappo_unity.training.match_series import MISSING
 from mappo_unity.training.run_state import RunState
 
 
@@ -41,13 +42,22 @@ class CheckpointSaver:
         return path if path.exists() else None
 
     def complete(self) -> None:
-        """Keep the state of the iteration that is just complete."""
-        self._complete = self._state.state_dict()
+        """Keep the state of the iteration that is just complete, but for a series of matches that is due."""
+        state = self._state
+        self._complete = state.state_dict()
+        self._complete["matches"][MISSING] = state.matches.is_due(state.agent_steps)
 
     def complete_matches(self) -> None:
         """Take the series of matches that was played after `complete` into what is kept."""
         assert self._complete is not None
         self._complete["matches"] = self._state.matches.state_dict()
+
+    def add_series(self) -> None:
+        """Write the checkpoint that is resumed once more, with the series of matches that it lacked."""
+        assert self.last is not None
+        self._complete, self._saved_iteration = checkpoint.load(self.last), None
+        self.complete_matches()
+        self.save(is_regular=False)
 
     def save_if_due(self, won: bool) -> None:
         """Save after the first iteration, at the regular interval, or where these weights won a series.

@@ -133,6 +133,11 @@ def _iterate(
     after_iteration: AfterIteration | None,
 ) -> str:
     """Iterate until the steps are done, the return is reached or a signal comes; return the status."""
+    if state.agent_steps >= cfg.max_steps and state.matches.is_missing:
+        state.play_matches()
+        saver.add_series()  # its iteration's row stays without it
+        log.message(state.matches.said)
+
     status = _status(cfg, state, stop)
     while status is None:
         started_s = time.perf_counter()
