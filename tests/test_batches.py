@@ -80,6 +80,24 @@ def test_a_batch_holds_what_was_asked_for_and_every_decision_is_learnt_once(tmp_
         assert waiting <= 10
 
 
+def dying_agents(seed: int, agents: int = 20) -> Any:
+    """Return a BaseEnv of agents that end one by one, and come back together when the last has ended."""
+    script: list[list[Record]] = []
+    for step in range(2000):
+        dead = step % agents
+        ended = dead - 1 if dead else agents - 1
+        last = [Record(ended, ends="terminated")] if step else []
+        script.append([*last, *[Record(agent) for agent in range(dead, agents)]])
+    return ScriptedEnv(script)
+
+
+def test_a_batch_that_begins_with_few_agents_becomes_no_large_one(tmp_path: Path) -> None:
+    with set_up(options(dying_agents, batch_size=1000), tmp_path) as setup, setup.collecting() as batches:
+        # 210 decisions in 20 rounds; one that begins with the last agent may not take it for all there are
+        counts = [next(batches).count_decisions("Fake") for _ in range(12)]
+    assert min(counts) >= 1000 and max(counts) < 1000 + 210
+
+
 def waiting_agent(seed: int) -> Any:
     """Return a BaseEnv in which agent 0 decides once, waits while agent 1 plays, and ends with reward 5."""
     script = [[Record(0), Record(1)], *([[Record(1, reward=1.0)]] * 5)]

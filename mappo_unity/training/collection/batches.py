@@ -84,7 +84,7 @@ class BatchCollector:
         missing = self._cfg.batch_size
         while missing > 0:
             # not everybody is asked in every round: what is missing then is played in further parts
-            parts.append(self._play(-(-missing // max(1, self._count_learning()))))
+            parts.append(self._play(-(-missing // max(1, self._expected()))))
             missing -= count_decisions(parts[-1], self._env.sides)
 
         return self._with_records(parts[0] if len(parts) == 1 else torch.cat(parts, 0))
@@ -94,11 +94,17 @@ class BatchCollector:
         self._env.restart()
         self._collector.reset_at_each_iter = True  # hands out what the reset has brought
 
-    def _count_learning(self) -> int:
-        """Return how many agents are there now that the learners play."""
-        if self._opponents is None:
-            return count_present(self._env)
-        return count_learning(self._env, self._opponents)
+    def _expected(self) -> int:
+        """Return how many agents of the learners a round may hold: those there now, or half of their slots.
+
+        Few may be there for a moment only: where all but one have died, the next round may bring all back,
+        and rounds for one would make a batch many times too large. Where few stay, further parts follow.
+        """
+        if self._opponents is not None:
+            present, slots = count_learning(self._env, self._opponents)
+        else:
+            present, slots = count_present(self._env), count_slots(self._env)
+        return max(present, slots // 2)
 
     def _play(self, rounds: int) -> TensorDictBase:
         self._collector.frames_per_batch = self._collector.requested_frames_per_batch = rounds
@@ -137,3 +143,8 @@ def count_decisions(rounds: TensorDictBase, names: Iterable[str]) -> int:
 def count_present(env: UnityEnv) -> int:
     """Return how many agents are there now."""
     return sum(int(behavior.present.sum()) for behavior in env.behaviors.values())
+
+
+def count_slots(env: UnityEnv) -> int:
+    """Return how many agents there can be at once."""
+    return sum(behavior.present.size for behavior in env.behaviors.values())

@@ -59,14 +59,18 @@ def split_episodes(
     return own, results
 
 
-def count_learning(env: UnityEnv, opponents: Opponents) -> int:
-    """Return how many agents are there now that learners play."""
-    count = 0
+def count_learning(env: UnityEnv, opponents: Opponents) -> tuple[int, int]:
+    """Return how many agents are there now that learners play, and how many slots these can have."""
+    count = slots = 0
     for name, sides in env.sides.items():
         present = torch.stack([torch.from_numpy(env.behaviors[side].present) for side in sides])
         players = opponents.playing.get(name)
         if players is not None:
             learns = (players == keys.LEARNER).cpu().reshape(len(sides), -1, 1)
-            present = present.reshape(*learns.shape[:2], -1) & learns
+            present = present.reshape(*learns.shape[:2], -1)
+            slots += int(learns.expand_as(present).sum())
+            present = present & learns
+        else:
+            slots += present.numel()
         count += int(present.sum())
-    return count
+    return count, slots
