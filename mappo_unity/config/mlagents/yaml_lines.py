@@ -53,7 +53,11 @@ def read_yaml(path: Path) -> Node:
     try:
         loader = yaml.SafeLoader(text)
         root = loader.get_single_node()
-        tree = Node({}, 1) if root is None else _node(path, loader, root)
+        if root is None:
+            tree = Node({}, 1)
+        else:
+            _check_twice(path, root, set())
+            tree = _node(loader, root)
     except yaml.MarkedYAMLError as error:
         raise ConfigError(_explain(path, text, error)) from error
     except ConfigError:
@@ -86,30 +90,42 @@ def inside(node: Node, word: str) -> Node:
     return node
 
 
-def _node(path: Path, loader: yaml.SafeLoader, node: yaml.Node) -> Node:
+def _node(loader: yaml.SafeLoader, node: yaml.Node) -> Node:
     line = node.start_mark.line + 1
     if isinstance(node, yaml.SequenceNode):
-        return Node([_node(path, loader, item) for item in node.value], line)
+        return Node([_node(loader, item) for item in node.value], line)
     if not isinstance(node, yaml.MappingNode):
         return Node(loader.construct_object(node), line)
 
-    _check_twice(path, node)
     loader.flatten_mapping(node)  # <<: *anchor
     # the line of a section is that of its name
     found = {}
     for key, item in node.value:
-        inner = _node(path, loader, item)
+        inner = _node(loader, item)
         found[str(key.value)] = Node(inner.value, key.start_mark.line + 1)
     return Node(found, line)
 
 
-def _check_twice(path: Path, node: yaml.MappingNode) -> None:
+def _check_twice(path: Path, node: yaml.Node, done: set[int]) -> None:
+    """Look for keys that are given twice, before `flatten_mapping` puts those of anchors beside a node's own.
+
+    `done`: ids of nodes; one with an anchor comes by several times.
+    """
+    if id(node) in done or not isinstance(node, yaml.CollectionNode):
+        return
+    done.add(id(node))
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _check_twice(path, item, done)
+        return
+
     seen: dict[str, int] = {}
-    for key, _ in node.value:
+    for key, item in node.value:
         name, line = str(key.value), key.start_mark.line + 1
         if name in seen:
             raise ConfigError(f"{path}, line {line}: {name} is given twice, first in line {seen[name]}")
         seen[name] = line
+        _check_twice(path, item, done)
 
 
 def _explain(path: Path, text: str, error: yaml.MarkedYAMLError) -> str:
