@@ -1,9 +1,14 @@
 """What mappo-learn reads beside plain files: anchors, values that follow from others, files of its own."""
 
 import pytest
+import yaml
+from test_learn import translated
 
+from mappo_unity.config.compose import compose_config
 from mappo_unity.config.mlagents.flags import parse_flags
 from mappo_unity.config.mlagents.read import read_settings
+from mappo_unity.config.mlagents.resolved import resolved
+from mappo_unity.config.mlagents.translate import translate
 from mappo_unity.errors import ConfigError
 
 
@@ -31,3 +36,33 @@ def test_what_is_given_twice_below_an_anchor_is_told(tmp_path):
     text = "behaviors:\n  A: &a {max_steps: 5, max_steps: 6}\n  B: *a\n"
     with pytest.raises(ConfigError, match="line 2: max_steps is given twice, first in line 2"):
         settings_of(tmp_path, text)
+
+
+# --- team_change
+
+
+def test_team_change_follows_from_save_steps_where_self_play_is_first_given(tmp_path):
+    def change(text):
+        return compose_config(translated(tmp_path, text).lines).config.self_play.team_change
+
+    above = "default_settings: {trainer_type: poca, self_play: {save_steps: 100}}\n"
+    assert change(above + "behaviors: {A: {self_play: {save_steps: 300}}}") == 500
+    assert change(above + "behaviors: {A: {self_play: {save_steps: 300, team_change: 7}}}") == 7
+    assert change("behaviors: {A: {trainer_type: poca, self_play: {save_steps: 300}}}") == 1500
+    off = "default_settings: {trainer_type: poca, self_play: null}\n"
+    assert change(off + "behaviors: {A: {self_play: {save_steps: 300}}}") == 1500
+
+
+@pytest.mark.parametrize("change", [None, 700])
+def test_the_configuration_of_a_run_can_be_read_again(tmp_path, change):
+    text = "behaviors: {A: {trainer_type: poca, self_play: {save_steps: 300}}}"
+    settings = settings_of(tmp_path, text)
+    lines = translate(settings).lines
+
+    configuration = resolved(settings)
+    own = configuration["behaviors"]["A"]["self_play"]
+    assert own["team_change"] == 1500
+    own["team_change"] = change  # earlier versions wrote null
+    again = translate(settings_of(tmp_path, yaml.safe_dump(configuration)))
+    expected = [line.replace("change=1500", f"change={change or 1500}") for line in lines]
+    assert again.lines == expected and again.warnings == []

@@ -86,6 +86,12 @@ def checkpoint_interval(section: Section) -> int:
     return section["checkpoint_interval"]
 
 
+def team_change(section: Section) -> int:
+    """Return steps between two changes of the learning team in self-play."""
+    given = section["self_play.team_change"]
+    return 5 * section["self_play.save_steps"] if given is None else given
+
+
 def _taken(section: Section, key: str) -> tuple[Any, str]:
     return section[key], section.where(key)
 

@@ -102,7 +102,7 @@ BEHAVIOR: dict[str, Key] = {
         "self_play",
         {
             "save_steps": Key(WHOLE, 20_000),
-            "team_change": Key(WHOLE, None),  # 5 x save_steps
+            "team_change": Key(WHOLE, None, optional=True),  # 5 x save_steps
             "swap_steps": Key(WHOLE, 2000),
             "window": Key(WHOLE, 10),
             "play_against_latest_model_ratio": Key(NUMBER, 0.5),

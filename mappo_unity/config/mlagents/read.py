@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from mappo_unity.config.mlagents.behavior import team_change
 from mappo_unity.config.mlagents.flags import Flags, flag_of
 from mappo_unity.config.mlagents.keys import BEHAVIOR, OPTIONAL, RENAMED, RUN, TOP, Key
 from mappo_unity.config.mlagents.settings import Given, Section, Settings, checked
@@ -68,14 +69,17 @@ class _Reader:
             return None
         own = self._flat(node, "default_settings")
         # expanded before behaviors come on top: their learning_rate_schedule does not spread any more, and
-        # their signals come beside the environment's
+        # their signals come beside the environment's, and their save_steps do not move team_change
         rate = own.get("hyperparameters.learning_rate_schedule")
         for name in _SPREAD:
             value = Given("linear", "default_settings") if rate is None else rate
             own.setdefault(f"hyperparameters.{name}", value)
-        if not Section(BEHAVIOR, own).has("reward_signals"):
+        section = Section(BEHAVIOR, own)
+        if not section.has("reward_signals"):
             own["reward_signals.extrinsic"] = Given({}, "default_settings")
-        return Section(BEHAVIOR, own)
+        if section.has("self_play"):
+            own["self_play.team_change"] = Given(team_change(section), section.where("self_play.team_change"))
+        return section
 
     def behaviors(self, tree: Node) -> Iterator[tuple[str, Node]]:
         node = tree.value.get("behaviors")

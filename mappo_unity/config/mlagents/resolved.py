@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from mappo_unity.config.mlagents.behavior import team_change
 from mappo_unity.config.mlagents.keys import OPTIONAL, RUN, SIGNALS
 from mappo_unity.config.mlagents.settings import Section, Settings
 
@@ -36,5 +37,8 @@ def _nested(section: Section, keys: list[str]) -> dict[str, Any]:
         inside = tree
         for part in above:
             inside = inside.setdefault(part, {})
-        inside[last] = section[key] if key in section.table else None
+        if key == "self_play.team_change":  # whose default follows from another key
+            inside[last] = team_change(section)
+        else:
+            inside[last] = section[key] if key in section.table else None
     return tree

@@ -13,6 +13,7 @@ from mappo_unity.config.mlagents.behavior import (
     behavior_warnings,
     checkpoint_interval,
     learner_options,
+    team_change,
 )
 from mappo_unity.config.mlagents.environment import MANY, environment_options
 from mappo_unity.config.mlagents.settings import Section, Settings, as_number
@@ -133,13 +134,9 @@ def _self_play(behaviors: list[Section], warnings: list[str]) -> Options:
     def total(key: str, count: Callable[[Section], int]) -> tuple[int, str]:
         return sum(count(section) for section in playing), first.where(f"self_play.{key}")
 
-    def change(section: Section) -> int:
-        given = section["self_play.team_change"]
-        return 5 * section["self_play.save_steps"] if given is None else given
-
     out: Options = {
         "self_play.save_steps": total("save_steps", lambda section: section["self_play.save_steps"]),
-        "self_play.team_change": total("team_change", change),
+        "self_play.team_change": total("team_change", team_change),
         "self_play.swap_steps": total("swap_steps", lambda section: section["self_play.swap_steps"]),
         "self_play.num_opponents": (1, "ML-Agents"),
     }
