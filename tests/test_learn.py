@@ -59,6 +59,12 @@ def test_help_says_what_each_flag_does(capsys):
         assert re.search(rf"^  {flag}( VALUE| \.\.\.)?( {{2,}}|\n {{20,}})\w", text, re.M), flag
 
 
+@pytest.mark.parametrize("short", ["--hel", "-hh"])
+def test_help_may_be_shortened_as_other_flags(capsys, short):
+    assert learn_main([short]) == 0
+    assert capsys.readouterr().out.startswith("usage: mappo-learn")
+
+
 def test_presets_of_ones_own_environment_are_no_scenes(tmp_path):
     with pytest.raises(
         ConfigError, match="there is no embedded scene 'pettingzoo'; scenes: 3DBall, Basic"
@@ -424,6 +430,7 @@ def test_a_mistake_is_one_line_with_file_line_and_key(tmp_path, monkeypatch, cap
         (["--run-id=a", "--initialize-from=a/b"], "--initialize-from=a/b must be the name of a folder"),
         (["--run-id=a/b", "--env-args", "--help", "-h", "--version"], "--run-id=a/b must be the name"),
         (["--env-args=foo"], "--env-args is written --env-args WORD ..."),
+        (["--run-id=none", "--inference"], "no run to play in results/none: give the --run-id of one"),
     ],
 )
 def test_mistakes_of_the_command_line(tmp_path, monkeypatch, capsys, flags, said):

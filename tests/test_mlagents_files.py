@@ -66,3 +66,21 @@ def test_the_configuration_of_a_run_can_be_read_again(tmp_path, change):
     again = translate(settings_of(tmp_path, yaml.safe_dump(configuration)))
     expected = [line.replace("change=1500", f"change={change or 1500}") for line in lines]
     assert again.lines == expected and again.warnings == []
+
+
+# --- lessons
+
+
+@pytest.mark.parametrize("criteria, is_told", [("null", False), ("{behavior: A, threshold: 0.5}", True)])
+def test_completion_criteria_of_the_last_lesson_are_told_where_there_are_any(tmp_path, criteria, is_told):
+    text = f"""
+behaviors: {{A: {{trainer_type: ppo}}}}
+environment_parameters:
+  mass:
+    curriculum:
+      - {{name: a, value: 1, completion_criteria: {{behavior: A, measure: progress, threshold: 0.1}}}}
+      - {{name: b, value: 2, completion_criteria: {criteria}}}
+"""
+    said = "my.yaml, line 4: environment_parameters.mass: the completion_criteria of the last lesson have no"
+    warnings = translated(tmp_path, text).warnings
+    assert len(warnings) == is_told and all(said in text for text in warnings)

@@ -49,6 +49,9 @@ def run(lines: list[str]) -> int:
     from mappo_unity.config.text_lines import literal_lines
 
     flags = learn_flags.parse_flags(lines)
+    if flags.help:
+        print(help_text())
+        return 0
     settings = read_settings(flags)
     translation = translate(settings)
     own = literal_lines(flags.options, Config)
@@ -289,10 +292,10 @@ def _play(settings: Settings, folder: Path, deterministic: bool) -> int:
     """Play the run of this name, or that of --initialize-from, without training."""
     from mappo_unity.cli import eval as evaluation
     from mappo_unity.config.text_lines import quoted_path
-    from mappo_unity.runs.results import check_place
+    from mappo_unity.runs.results import check_playable
 
     name = settings.run["checkpoint_settings.initialize_from"]
     if name is not None and not resumes(settings.run):
         folder = _run_folder(settings, name)
-    check_place(folder, resume=True, force=False)
+    check_playable(folder)
     return evaluation.run([f"run={quoted_path(folder)}", f"deterministic={str(deterministic).lower()}"])

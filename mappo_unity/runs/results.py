@@ -57,6 +57,16 @@ def check_place(folder: Path, resume: bool, force: bool) -> None:
             raise ConfigError(f"{folder} holds no run that --force could replace: give another --run-id")
 
 
+def check_playable(folder: Path) -> None:
+    """Raise ConfigError where there is no run that could be played."""
+    if not (folder / CONFIG).is_file():
+        trained = (folder / CONFIGURATION).is_file()
+        other = "mlagents-learn trained there, whose .pt files this trainer cannot read; " if trained else ""
+        raise ConfigError(
+            f"no run to play in {folder}: {other}give the --run-id of one, or leave --inference out to train"
+        )
+
+
 @contextmanager
 def replaced(folder: Path, force: bool) -> Iterator[None]:
     """Set a run that is to be replaced aside; it comes back if the new one trains nothing.

@@ -63,6 +63,8 @@ class Flags:
     """Options of ours, ppo.epochs=4, which beat everything."""
     deterministic: bool = False
     print_options: bool = False
+    help: bool = False
+    """In a short form that only the parser knows, such as --hel."""
     warnings: list[str] = field(default_factory=list)
 
 
@@ -98,6 +100,7 @@ def parse_flags(arguments: list[str]) -> Flags:
     flags.config = files[0] if files else None
     flags.deterministic = known.pop("deterministic")
     flags.print_options = known.pop("print_options")
+    flags.help = known.pop("help")
     for flag in _DEPRECATED:
         if known.pop(flag.lstrip("-")):
             flags.warnings.append(_about(flag))
@@ -129,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
         add_help=False,
     )
     parser.add_argument("words", nargs="*", help=argparse.SUPPRESS)
-    parser.add_argument("--help", "-h", action="store_true", help="show this text", default=argparse.SUPPRESS)
+    parser.add_argument("--help", "-h", action="store_true", help="show this text")
     parser.add_argument(
         "--print-options",
         action="store_true",

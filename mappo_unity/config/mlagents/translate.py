@@ -237,5 +237,6 @@ def _about_lessons(where: str, value: Any) -> Iterator[str]:
         criteria = lesson.get("completion_criteria") if isinstance(lesson, dict) else None
         if isinstance(criteria, dict) and "behavior" not in criteria:
             raise ConfigError(f"{where}: a lesson's completion_criteria have no behavior, which they need")
-    if lessons and isinstance(lessons[-1], dict) and "completion_criteria" in lessons[-1]:
+    last = lessons[-1] if lessons else None
+    if isinstance(last, dict) and last.get("completion_criteria") is not None:
         yield f"{where}: the completion_criteria of the last lesson have no effect"
