@@ -84,3 +84,58 @@ environment_parameters:
     said = "my.yaml, line 4: environment_parameters.mass: the completion_criteria of the last lesson have no"
     warnings = translated(tmp_path, text).warnings
     assert len(warnings) == is_told and all(said in text for text in warnings)
+
+
+# --- mistakes that only the open environment knows
+
+
+PARAMETERS = """
+behaviors: {3DBall: {trainer_type: ppo}}
+environment_parameters:
+  mass:
+    curriculum:
+      - {name: a, value: 1, completion_criteria: {behavior: 3DBall, measure: progress, threshold: 0.1}}
+      - name: b
+        value: 2
+  ball.size: 3
+"""
+
+
+@pytest.mark.parametrize(
+    "said, place",
+    [
+        (
+            "env.params.mass.lessons[1].value=2: no",
+            "line 8: environment_parameters.mass.lessons[1].value=2: no",
+        ),
+        (
+            "scene X has no parameter 'mass'; choices: none",
+            "line 4: environment_parameters.mass: scene X has no",
+        ),
+        (
+            "scene X has no parameter 'ball.size'; choices: none",
+            "line 9: environment_parameters.ball.size: scene",
+        ),
+        (
+            "parameter mass=2 of scene X is out of",
+            "line 4: environment_parameters.mass: parameter mass=2 of scene",
+        ),
+        (
+            "parameter mass of scene X acts at once",
+            "line 4: environment_parameters.mass: parameter mass of scene",
+        ),
+        ("env.params.masses.lessons[1]: no", "env.params.masses.lessons[1]: no"),
+    ],
+)
+def test_a_parameter_that_the_environment_does_not_take_is_told_with_its_line(tmp_path, said, place):
+    told = str(translated(tmp_path, PARAMETERS, "--env=scene:3DBall").explain(ConfigError(said)))
+    assert place in told and told.endswith(said.removeprefix("env.params.mass.lessons"))
+    assert told.startswith(f"{tmp_path / 'my.yaml'}, line ") == place.startswith("line ")
+
+
+def test_what_is_told_below_an_error_stays(tmp_path):
+    error = ConfigError("ppo.lr=2 is too large")
+    error.details = ("a traceback of the user's code",)
+    told = translated(tmp_path, "behaviors:\n  A: {hyperparameters: {learning_rate: 2}}").explain(error)
+    assert "line 2: behaviors.A.hyperparameters.learning_rate: ppo.lr=2 is too large" in str(told)
+    assert told.details == error.details

@@ -24,6 +24,9 @@ from mappo_unity.errors import ConfigError
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_-]+")
 _WORDS = ("name", "behavior", "measure", "sampler_type")  # keys of environment_parameters that are texts
 _WHOLE = ("min_lesson_length", "seed")  # and those that are whole numbers
+_PARAMETERS = "env.params."
+_OF_SCENE = re.compile(r"scene \S+ has no parameter '(.*?)';|parameter (.*?)(?:=.*?)? of scene ")
+"""What scenes say of a parameter, which they know without the option's sections before it."""
 _SIMPLE = re.compile(r"(?!null$|true$|false$|inf$|nan$)[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -34,10 +37,27 @@ class Translation:
     lines: list[str]
     warnings: list[str]
     sources: dict[str, str] = field(default_factory=dict)
+    places: Callable[[str, str], str] = lambda name, rest: ""
+    """See `Settings.places`."""
 
     def explain(self, error: ConfigError) -> ConfigError:
         """Return an error about an option with the place that it comes from in front."""
-        text = str(error)
+        text = self._with_place(str(error))
+        if text is None:
+            return error
+        told = ConfigError(text)
+        told.details = error.details
+        return told
+
+    def _with_place(self, text: str) -> str | None:
+        about = _OF_SCENE.match(text)
+        for name in [key.removeprefix(_PARAMETERS) for key in self.sources if key.startswith(_PARAMETERS)]:
+            if about is not None and name in about.groups():
+                return f"{self.places(name, '')}: {text}"
+            rest = text.removeprefix(f"{_PARAMETERS}{name}")
+            if rest != text and rest[:1] in (".", "["):  # a key of the parameter, or one of its lessons
+                return f"{self.places(name, rest)}{rest}"
+
         behavior = re.match(r"(behaviors\..+?\.)\w+: ", text)
         start, own = (behavior.end(), behavior[1]) if behavior else (0, "")
         option = re.match(r"[\w.]+", text[start:])
@@ -46,7 +66,7 @@ class Translation:
         names = [] if option is None else [own + option[0], option[0]]
         where = next((self.sources[name] for name in names if name in self.sources), "")
         rest = text.removeprefix(where.rpartition(": ")[2] + ": ")
-        return ConfigError(f"{where}: {rest}") if "line " in where else error
+        return f"{where}: {rest}" if "line " in where else None
 
 
 def translate(settings: Settings) -> Translation:
@@ -77,8 +97,9 @@ def translate(settings: Settings) -> Translation:
     lines = [f"{key}={_line_value(key, value)}" for key, (value, _) in options.items()]
     sources |= {key: where for key, (_, where) in options.items()}
     sources |= {f"behaviors.{name}": section.place for name, section in sections.items()}
+    sources |= {f"{_PARAMETERS}{name}": given.where for name, given in settings.parameters.items()}
     # what default_settings gives is told once, not for each behavior
-    return Translation(lines, list(dict.fromkeys(warnings)), sources)
+    return Translation(lines, list(dict.fromkeys(warnings)), sources, settings.places)
 
 
 def _line_value(key: str, value: Any) -> str:
