@@ -3,8 +3,8 @@
 import pytest
 from omegaconf import OmegaConf
 
-from mappo_unity.cli import train_main
-from mappo_unity.config.compose import load_config
+from mappo_unity.cli import learn_main, train_main
+from mappo_unity.config.compose import compose_config, load_config
 from mappo_unity.config.renamed import rename_keys, rename_lines
 from mappo_unity.config.schema import Activation, CriticKind, LoggerKind, MirrorConfig, ModelConfig
 from mappo_unity.policies.policy import model_from_saved
@@ -26,6 +26,8 @@ def test_lines_and_keys():
         "log": {"loggers": ["csv"], "project": "p"},
         "seed": 1,
     }
+    assert rename_keys({"seed": 1, "log.backends": ["csv"]}) == {"log.loggers": ["csv"], "seed": 1}
+    assert rename_keys({"log.loggers": [], "log.backends": ["csv"]}) == {"log.loggers": []}
 
 
 def test_the_old_name_keeps_working_with_a_note(tmp_path, monkeypatch, capfd):
@@ -40,6 +42,24 @@ def test_the_old_name_keeps_working_with_a_note(tmp_path, monkeypatch, capfd):
     OmegaConf.save(saved, "run/config.yaml")
     assert load_config(tmp_path / "run/config.yaml").log.loggers == [LoggerKind.csv]
     assert train_main(["resume=run", "max_steps=128"]) == 0
+
+
+def test_the_old_name_in_a_file_of_options(tmp_path):
+    for text in (
+        "log: {backends: [csv]}",
+        "log.backends: [csv]",
+        "{log.backends: [], log: {loggers: [csv]}}",
+    ):
+        (tmp_path / "my.yaml").write_text(text)
+        config = compose_config([], file=tmp_path / "my.yaml").config
+        assert config.log.loggers == [LoggerKind.csv], text
+
+
+def test_mappo_learn_takes_the_old_name_with_a_note(capsys):
+    assert learn_main(["--env=scene:3DBall", "--print-options", "log.backends=[csv]"]) == 0
+    captured = capsys.readouterr()
+    assert "mappo-learn: note: log.backends is called log.loggers now" in captured.err
+    assert "log.loggers=[csv]" in captured.out.replace("'", "")
 
 
 def test_a_checkpoint_that_does_not_know_a_model_option_yet_has_its_default(tmp_path):

@@ -45,6 +45,7 @@ def run(lines: list[str]) -> int:
     from mappo_unity.config.mlagents.read import read_settings
     from mappo_unity.config.mlagents.translate import translate
     from mappo_unity.config.overrides import given_options, shell_word
+    from mappo_unity.config.renamed import rename_lines
     from mappo_unity.config.schema import Config
     from mappo_unity.config.text_lines import literal_lines
 
@@ -54,7 +55,8 @@ def run(lines: list[str]) -> int:
         return 0
     settings = read_settings(flags)
     translation = translate(settings)
-    own = literal_lines(flags.options, Config)
+    renamed = rename_lines(flags.options, lambda text: print(f"mappo-learn: {text}", file=sys.stderr))
+    own = literal_lines(renamed, Config)
     for key in given_options(own):  # its value comes from the command line
         if key in _PLACES:
             raise ConfigError(f"{key} does not go with mappo-learn, whose flag is {_PLACES[key]}")

@@ -24,8 +24,12 @@ def rename_lines(lines: list[str], note: Callable[[str], None] = lambda text: No
 
 
 def rename_keys(options: dict[Any, Any]) -> dict[Any, Any]:
-    """Return nested options (a run's config.yaml) with today's names."""
+    """Return a file's options, nested (log: {backends: ...}) or dotted (log.backends), with today's names."""
     for old, new in RENAMED.items():
+        if old in options:
+            # in front: where both names stand, today's wins, dotted or nested
+            options = {new: options[old]} | {key: value for key, value in options.items() if key != old}
+
         section, _, name = old.partition(".")
         inside = options.get(section)
         if isinstance(inside, dict) and name in inside:
