@@ -47,6 +47,21 @@ def test_a_part_of_the_options_goes_over_the_presets() -> None:
     assert compose(text, "ppo.lr=1").ppo.lr == 1
 
 
+def test_a_parameter_of_the_file_takes_the_place_of_the_presets() -> None:
+    text = "env: {name: CooperativePushBlock, params: {gravity: {sampler: uniform, min: 5, max: 15}}}"
+
+    def gravity(*lines: str) -> Any:
+        return compose(text, *lines).env.params["gravity"]
+
+    assert gravity() == {"sampler": "uniform", "min": 5, "max": 15}
+    assert gravity("env.params.gravity.max=7") == {"sampler": "uniform", "min": 5, "max": 7}
+    assert gravity("recipe=mlagents") == 14.715
+    Path("my.yaml").write_text(text)
+    assert train_main(["-m", "seed=1,2", "hydra.sweep.dir=here", "--config", "my.yaml"]) == 0
+    for job in "01":
+        assert load_config(Path("here", job, "config.yaml")).env.params == {"gravity": gravity()}
+
+
 def test_the_name_of_an_env_chooses_its_preset() -> None:
     assert compose("env: {name: Basic}\n") == compose_config(["env=Basic"]).config
     assert compose("env: {name: Mine}\n").env.name == "Mine"

@@ -21,7 +21,7 @@ from mappo_unity.config import effects
 from mappo_unity.config.behavior_lines import OPEN
 from mappo_unity.config.extras import SWEEP_EXTRA
 from mappo_unity.config.option_table import option_table
-from mappo_unity.config.options_file import file_root, read_yaml
+from mappo_unity.config.options_file import CLEARED, cleared, file_root, read_yaml
 from mappo_unity.config.overrides import (
     add_plus_prefix,
     check_overrides,
@@ -29,8 +29,7 @@ from mappo_unity.config.overrides import (
     given_options,
     parse,
 )
-from mappo_unity.config.parameters.curriculum import is_curriculum
-from mappo_unity.config.parameters.samplers import is_sampler
+from mappo_unity.config.parameters.values import is_whole
 from mappo_unity.config.plain_options import check_form
 from mappo_unity.config.presets import NO_CHOICE, conf_dir, group_choices
 from mappo_unity.config.renamed import rename_keys
@@ -122,7 +121,9 @@ def register_root(lines: list[str], base: Path | None = None, file: Path | None 
         return "resumed"
 
     if file is not None:
-        store.store(name="from_file", node=file_root(file, lines))
+        root = file_root(file, lines)
+        store.store(name=CLEARED, node=cleared(root), package="_global_")
+        store.store(name="from_file", node=root)
         return "from_file"
 
     return "config"
@@ -228,7 +229,7 @@ def _keep_parameters_whole(tree: DictConfig, lines: list[str]) -> None:
             continue
 
         for parameter, raw in ({name: value} if name else value or {}).items():
-            if not isinstance(raw, dict) or is_sampler(raw) or is_curriculum(raw):
+            if is_whole(raw):
                 with open_dict(tree):
                     tree.env.params[parameter] = raw
 

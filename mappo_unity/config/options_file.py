@@ -13,11 +13,14 @@ from omegaconf import OmegaConf
 
 from mappo_unity.config import presets
 from mappo_unity.config.overrides import check_value, last_value, shell_word
+from mappo_unity.config.parameters.values import is_whole
 from mappo_unity.config.renamed import rename_keys
 from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 
 SWITCH = "--config"
+CLEARED = "cleared"
+"""The name under which Hydra finds what `cleared` returns."""
 _SUFFIXES = (".yaml", ".yml")
 _CHOICES = ("env", "parameters", "recipe")  # groups that a file may choose by name
 
@@ -76,8 +79,18 @@ def file_root(path: Path, lines: list[str]) -> dict[Any, Any]:
     if last_value(lines, "recipe") is not None:
         entries.remove("_self_")
         entries.insert(1 + [_group(entry) for entry in entries].index("env"), "_self_")
+    entries.insert(entries.index("_self_"), CLEARED)
 
     return {"defaults": entries, **root, **options}
+
+
+def cleared(root: dict[Any, Any]) -> dict[str, Any]:
+    """Return what lies right below a file's options: null for each parameter that they give as a whole.
+
+    Hydra would mix the keys of its sampler or lessons with those of a preset.
+    """
+    params = root.get("env", {}).get("params", {})
+    return {"env": {"params": {name: None for name, raw in params.items() if is_whole(raw)}}}
 
 
 def read_yaml(path: Path, missing: str | None = None) -> Any:

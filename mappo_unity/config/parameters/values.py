@@ -79,6 +79,11 @@ def later_values(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
         yield from ((name, lesson.value) for lesson in curriculum.lessons[1:])
 
 
+def is_whole(raw: Any) -> bool:
+    """Return whether what options say of a parameter is all of it, rather than some of its keys."""
+    return not isinstance(raw, dict) or is_sampler(raw) or is_curriculum(raw)
+
+
 def show_parameter(value: Any) -> str:
     """Return a value for reading: ``2``, ``uniform 0.5 to 10``."""
     return f"{value:g}" if isinstance(value, float) else str(value)
