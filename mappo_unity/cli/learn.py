@@ -55,7 +55,7 @@ def run(lines: list[str]) -> int:
         return 0
     settings = read_settings(flags)
     translation = translate(settings)
-    renamed = rename_lines(flags.options, lambda text: print(f"mappo-learn: {text}", file=sys.stderr))
+    renamed = rename_lines(flags.options, _tell)
     own = literal_lines(renamed, Config)
     for key in given_options(own):  # its value comes from the command line
         if key in _PLACES:
@@ -69,7 +69,7 @@ def run(lines: list[str]) -> int:
         raise translation.explain(error) from error
 
     for text in [*translation.warnings, *_about_flags(settings, flags)]:
-        print(f"mappo-learn: {text}", file=sys.stderr)
+        _tell(text)
     if flags.print_options:
         print(*map(shell_word, options), sep="\n")
         return 0
@@ -158,6 +158,7 @@ def _run_lines(
 ) -> list[str]:
     """Return all lines of a run: below the options where it goes and what it begins with."""
     from mappo_unity.config.compose import load_config
+    from mappo_unity.config.mlagents.unnamed import lines_over
     from mappo_unity.config.overrides import last_value
     from mappo_unity.config.schema import Backend
     from mappo_unity.config.text_lines import quoted_path
@@ -165,7 +166,8 @@ def _run_lines(
     from mappo_unity.runs.results import LOGS
 
     if resume:
-        env, path = load_config(folder / CONFIG).env, settings.run["env_settings.env_path"]
+        saved, path = load_config(folder / CONFIG), settings.run["env_settings.env_path"]
+        env = saved.env
         is_scene = env.backend is Backend.embedded
         if path is None:  # where it was trained, not the Editor
             other = _OF_SCENES if is_scene else _OF_PLACES
@@ -180,6 +182,7 @@ def _run_lines(
             )
         elif env.backend is Backend.editor:
             translated = [*translated, "env.backend=player"]
+        translated = [*translated, *lines_over(settings, saved, own, _tell)]
         options = [*translated, *own]
         names = [line.partition("=")[0] for line in options]
         kept = [line for name, line in zip(names, options) if not _is_kept(name)]
@@ -189,7 +192,7 @@ def _run_lines(
     lines = [f"hydra.run.dir={quoted_path(folder)}", *_beginning(settings)]
     if settings.run["env_settings.seed"] < 0 and last_value(options, "seed") is None:
         seed = random.SystemRandom().randrange(_SEEDS)
-        print(f"mappo-learn: no seed is given: seed={seed} is drawn", file=sys.stderr)
+        _tell(f"no seed is given: seed={seed} is drawn")
         lines.append(f"seed={seed}")
     if scene_of(settings) is None and settings.run["env_settings.env_path"] is not None:
         lines.append(f"env.player_logs={quoted_path(folder / LOGS)}")
@@ -245,9 +248,7 @@ def _launch(settings: Settings, lines: list[str], folder: Path) -> int:
             policies.extend(state.setup.learners)
             results.write_configuration(folder, resolved(settings))
 
-    launched = launch(
-        lines, warn=lambda text: print(f"mappo-learn: {text}", file=sys.stderr), after_iteration=look_on
-    )
+    launched = launch(lines, warn=_tell, after_iteration=look_on)
     outcome = launched.outcome
     if outcome is None:
         print(launched.message)
@@ -261,8 +262,12 @@ def _launch(settings: Settings, lines: list[str], folder: Path) -> int:
     if outcome.signal is None:
         return _MOST_ROLLED_BACK if outcome.status == "diverged" else 0
     name = signal.Signals(outcome.signal).name
-    print(f"mappo-learn: ended by {name}; --resume goes on", file=sys.stderr)
+    _tell(f"ended by {name}; --resume goes on")
     return 128 + outcome.signal
+
+
+def _tell(text: str) -> None:
+    print(f"mappo-learn: {text}", file=sys.stderr)
 
 
 def _publish(folder: Path, last: Path | None, policies: Sequence[str] = (), mean: float = math.nan) -> None:
@@ -279,7 +284,7 @@ def _publish(folder: Path, last: Path | None, policies: Sequence[str] = (), mean
     if RunExports(folder, print).is_behind(step_of(last)):
         for path in (folder / f"{policy}.onnx" for policy in policies):
             if path.is_file():
-                print(f"mappo-learn: no ONNX file of {last} was written: {path} is older", file=sys.stderr)
+                _tell(f"no ONNX file of {last} was written: {path} is older")
         return
 
     if policies:

@@ -92,6 +92,18 @@ def team_change(section: Section) -> int:
     return 5 * section["self_play.save_steps"] if given is None else given
 
 
+def nested(options: Options) -> dict[str, Any]:
+    """Return the values of options by section: {ppo: {lr: 1e-4}}."""
+    tree: dict[str, Any] = {}
+    for key, (value, _) in options.items():
+        inside = tree
+        *above, last = key.split(".")
+        for part in above:
+            inside = inside.setdefault(part, {})
+        inside[last] = value
+    return tree
+
+
 def _taken(section: Section, key: str) -> tuple[Any, str]:
     return section[key], section.where(key)
 

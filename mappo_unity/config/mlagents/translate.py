@@ -13,6 +13,7 @@ from mappo_unity.config.mlagents.behavior import (
     behavior_warnings,
     checkpoint_interval,
     learner_options,
+    nested,
     team_change,
 )
 from mappo_unity.config.mlagents.environment import MANY, environment_options
@@ -193,23 +194,12 @@ def _learners(sections: dict[str, Section], default: Section | None) -> tuple[Op
         if _PLAIN_NAME.fullmatch(name) and differing:
             out |= {f"behaviors.{name}.{key}": value for key, value in differing.items()}
         else:  # a name with dots and the like, or a behavior that is only named
-            trees[name] = _tree(differing)
+            trees[name] = nested(differing)
             sources |= {f"behaviors.{name}.{key}": where for key, (_, where) in differing.items()}
     if trees:
         out["behaviors"] = (trees, "behaviors")
     out["only_named_behaviors"] = (default is None, "behaviors")
     return out, sources
-
-
-def _tree(options: Options) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
-    for key, (value, _) in options.items():
-        inside = tree
-        *above, last = key.split(".")
-        for part in above:
-            inside = inside.setdefault(part, {})
-        inside[last] = value
-    return tree
 
 
 # --- environment parameters

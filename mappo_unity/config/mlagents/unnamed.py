@@ -1,0 +1,79 @@
+"""What a run that is resumed has, and the lines of the file do not name: the file rules there, too."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from mappo_unity.config.behavior_lines import dotted_options, written
+from mappo_unity.config.compose import compose_tree
+from mappo_unity.config.mlagents.behavior import Options, learner_options, nested
+from mappo_unity.config.mlagents.settings import Settings
+from mappo_unity.config.presets import group_choices
+from mappo_unity.config.schema import Config
+
+_PARAMETERS, _BEHAVIORS = "env.params", "behaviors"
+_DELETABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
+
+
+def lines_over(settings: Settings, saved: Config, own: list[str], tell: Callable[[str], None]) -> list[str]:
+    """Return lines with which the file rules over what a run that is resumed has and its lines do not name.
+
+    Args:
+        settings: the file and the flags.
+        saved: the run's own options.
+        own: options of the command line.
+        tell: takes a line for the user about each environment parameter that the run loses, or keeps.
+    """
+    if not settings.behaviors and settings.default is not None and not settings.default.given:
+        return []  # there is no file
+
+    lines = []
+    # lines name what differs from the options of all: what differs no longer would stay as it was
+    learners = {name: nested(options) for name, options in _learners(settings, saved) if options}
+    if learners:
+        lines.append(f"{_BEHAVIORS}={written(learners)}")
+
+    for name in _dropped_parameters(settings, saved, own):
+        is_gone = _DELETABLE.fullmatch(name) is not None
+        if is_gone:
+            lines.append(f"~{_PARAMETERS}.{name}")
+        end = "goes on without it" if is_gone else "keeps it, since no override can take such a name away"
+        tell(f"{_PARAMETERS}.{name} stands neither in the file nor among the options: the run {end}")
+    return lines
+
+
+def _learners(settings: Settings, saved: Config) -> Iterator[tuple[str, Options]]:
+    """Yield each behavior's options that the saved run has for it alone, with the file's values."""
+    for name, tree in saved.behaviors.items():
+        section = settings.behaviors.get(name, settings.default)
+        if section is not None:
+            options = learner_options(name, section)
+            options.pop("init_from", None)  # a resumed run has its own networks
+            yield name, {key: value for key, value in options.items() if _holds(tree, key)}
+
+
+def _dropped_parameters(settings: Settings, saved: Config, own: list[str]) -> list[str]:
+    """Return the saved run's environment parameters that the file, the options and the preset do not name."""
+    preset = [line for line in own if line.startswith("parameters=")]
+    if saved.env.name in group_choices()["env"]:  # env.name may be any name
+        preset.append(f"env={saved.env.name}")
+    known = {*settings.parameters, *compose_tree(preset).env.params}
+    return [
+        name for name in saved.env.params if name not in known and not _is_given(f"{_PARAMETERS}.{name}", own)
+    ]
+
+
+def _is_given(option: str, lines: list[str]) -> bool:
+    """Return whether lines set an option or one below it, or delete it."""
+    names = [name for line in lines for name in dotted_options(line.lstrip("+~"))]
+    return any(name == option or name.startswith(f"{option}.") for name in names)
+
+
+def _holds(tree: Any, key: str) -> bool:
+    for part in key.split("."):
+        if not isinstance(tree, Mapping) or part not in tree:
+            return False
+        tree = tree[part]
+    return True
