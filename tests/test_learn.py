@@ -708,6 +708,38 @@ def test_an_environment_with_more_behaviors_is_refused_without_default_settings(
     assert "SmallWallJump" in capsys.readouterr().err
 
 
+def test_a_behavior_that_only_the_preset_names_is_one_that_the_file_does_not(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("my.yaml").write_text("behaviors: {Goalie: {trainer_type: ppo}}\n")
+    flags = ["my.yaml", "--env=scene:StrikersVsGoalie", "--seed=1"]
+    assert learn_main(flags) == 2
+    said = (
+        "the environment has Striker, which the file does not name: give behaviors.Striker there, or default"
+    )
+    assert said in capsys.readouterr().err and os.listdir() == ["my.yaml"]
+
+    monkeypatch.setattr(learn, "_launch", lambda *args: 0)
+    assert learn_main([*flags, "behaviors.Striker.train=false"]) == 0
+    assert learn_main([*flags, "only_named_behaviors=false"]) == 0
+    Path("my.yaml").write_text("default_settings: {trainer_type: ppo}\n")
+    assert learn_main(flags) == 0
+
+
+@pytest.mark.parametrize(
+    "text, flags",
+    [("", ["--initialize-from=first"]), ("    init_path: results/first/3DBall.onnx\n", [])],
+)
+def test_a_run_that_is_replaced_is_nothing_to_begin_with(trained, tmp_path, monkeypatch, capsys, text, flags):
+    monkeypatch.chdir(trained)
+    before = sorted(Path("results").rglob("*"))
+    file = tmp_path / "other.yaml"
+    file.write_text(BALL + text)
+    assert learn_main([str(file), "--run-id=first", "--force", "--seed=1", *flags, *SMALL]) == 2
+    said = "lies in results/first, which the new run replaces: give another --run-id"
+    assert said in capsys.readouterr().err
+    assert sorted(Path("results").rglob("*")) == before
+
+
 def test_initialize_from_of_the_command_line_beats_resume_of_the_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("my.yaml").write_text(BALL + "checkpoint_settings: {resume: true, initialize_from: a}\n")

@@ -135,6 +135,7 @@ def _run_folder(settings: Settings, name: str, flag: str = "--run-id") -> Path:
 
 
 def _train(settings: Settings, translation: Translation, options: list[str], folder: Path) -> int:
+    from mappo_unity.config.mlagents.unnamed import check_named
     from mappo_unity.runs import results
 
     run = settings.run
@@ -146,7 +147,9 @@ def _train(settings: Settings, translation: Translation, options: list[str], fol
     try:
         with interrupts_wait():
             if not resume:
-                _check(lines)
+                config = _check(lines)
+                check_named(settings, config, own)
+                results.check_beginning(folder, config)
         with results.replaced(folder, force and not resume):
             return _launch(settings, lines, folder)
     except ConfigError as error:
@@ -223,14 +226,15 @@ def _beginning(settings: Settings) -> list[str]:
     return [f"behaviors={written(starts)}"]
 
 
-def _check(lines: list[str]) -> None:
-    """Find mistakes before a run that is to be replaced is touched."""
+def _check(lines: list[str]) -> Config:
+    """Find mistakes before a run that is to be replaced is touched; return the options."""
     from mappo_unity.config.compose import check_effect
     from mappo_unity.policies.first_checks import check_environment
 
     config = _composed(lines)
     check_effect(lines, [config])
     check_environment(config)
+    return config
 
 
 def _launch(settings: Settings, lines: list[str], folder: Path) -> int:

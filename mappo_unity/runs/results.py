@@ -17,6 +17,8 @@ from typing import Any
 import yaml
 
 from mappo_unity import keys
+from mappo_unity.config.per_behavior import init_source
+from mappo_unity.config.schema import Config
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.atomic import write_atomically
 from mappo_unity.runs.checkpoint_file import FOLDER, read_plain
@@ -55,6 +57,17 @@ def check_place(folder: Path, resume: bool, force: bool) -> None:
     if is_taken and force:
         if not is_run and not (folder / CONFIGURATION).is_file():
             raise ConfigError(f"{folder} holds no run that --force could replace: give another --run-id")
+
+
+def check_beginning(folder: Path, config: Config) -> None:
+    """Raise ConfigError where a new run is to begin with networks that lie in the run that it replaces."""
+    starts = [("init_from", config.init_from), *(init_source(config, name) for name in config.behaviors)]
+    for option, source in starts:
+        path = Path(source or "").resolve()
+        if source is not None and folder.resolve() in (path, *path.parents):
+            raise ConfigError(
+                f"{option}={source} lies in {folder}, which the new run replaces: give another --run-id"
+            )
 
 
 def check_playable(folder: Path) -> None:

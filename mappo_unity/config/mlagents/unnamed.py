@@ -1,4 +1,4 @@
-"""What a run that is resumed has, and the lines of the file do not name: the file rules there, too."""
+"""What a preset or a run that is resumed has, and the file does not name: the file rules there, too."""
 
 from __future__ import annotations
 
@@ -12,9 +12,33 @@ from mappo_unity.config.mlagents.behavior import Options, learner_options, neste
 from mappo_unity.config.mlagents.settings import Settings
 from mappo_unity.config.presets import group_choices
 from mappo_unity.config.schema import Config
+from mappo_unity.errors import ConfigError
 
 _PARAMETERS, _BEHAVIORS = "env.params", "behaviors"
 _DELETABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
+
+
+def check_named(settings: Settings, config: Config, own: list[str]) -> None:
+    """Refuse behaviors that are in a run's options only since the scene's preset names them.
+
+    Args:
+        settings: the file and the flags.
+        config: the options of a new run.
+        own: options of the command line, which may name behaviors, too.
+
+    Raises:
+        ConfigError: naming them, as ML-Agents refuses behaviors that have no section.
+    """
+    missing = [
+        name
+        for name in config.behaviors
+        if name not in settings.behaviors and not _is_given(f"{_BEHAVIORS}.{name}", own)
+    ]
+    if config.only_named_behaviors and missing:
+        raise ConfigError(
+            f"the environment has {', '.join(missing)}, which the file does not name: give "
+            f"{', '.join(f'{_BEHAVIORS}.{name}' for name in missing)} there, or default_settings"
+        )
 
 
 def lines_over(settings: Settings, saved: Config, own: list[str], tell: Callable[[str], None]) -> list[str]:
