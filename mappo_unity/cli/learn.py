@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from mappo_unity.config.mlagents import flags as learn_flags
 from mappo_unity.config.mlagents.environment import resumes, scene_of
+from mappo_unity.config.mlagents.ineffective import about_flags, is_kept
 from mappo_unity.errors import ConfigError
 from mappo_unity.signals import interrupts_wait
 
@@ -23,11 +24,6 @@ if TYPE_CHECKING:
 
 _SEEDS = 10_000  # of those that ML-Agents draws where none is given
 _MOST_ROLLED_BACK = 4
-_FIXED = ("env", "recipe", "seed", "env.num_areas")
-_KEPT = ("env_settings.seed", "env_settings.num_areas")
-"""Options of a run that a resumed one keeps, and ML-Agents' names of two that have flags."""
-_OF_PLAYERS = ("env_settings.num_envs", "env_settings.env_args", "engine_settings.no_graphics")
-"""What is said anew with a build, and else kept as well."""
 _PLACES = {"hydra.run.dir": "--run-id=NAME", "output_dir": "--results-dir=FOLDER", "resume": "--resume"}
 """Options of ours that say where a run lies, and the flags that do so here."""
 _OF_PLACES = re.compile(r"env\.(backend|port)=")
@@ -68,7 +64,7 @@ def run(lines: list[str]) -> int:
     except ConfigError as error:
         raise translation.explain(error) from error
 
-    for text in [*translation.warnings, *_about_flags(settings, flags)]:
+    for text in [*translation.warnings, *about_flags(settings, flags)]:
         _tell(text)
     if flags.print_options:
         print(*map(shell_word, options), sep="\n")
@@ -78,39 +74,6 @@ def run(lines: list[str]) -> int:
     if settings.run["checkpoint_settings.inference"]:
         return _play(settings, folder, flags.deterministic)
     return _train(settings, translation, options, folder)
-
-
-def _about_flags(settings: Settings, flags: learn_flags.Flags) -> list[str]:
-    """Return lines about flags that have no effect beside others."""
-    run, said = settings.run, []
-    if run["checkpoint_settings.inference"]:
-        ignored = [learn_flags.flag_of(key) for key in flags.given if not key.startswith("checkpoint_")]
-        ignored += flags.options
-        if flags.config is not None:
-            ignored.insert(0, flags.config)
-        if ignored:
-            said.append(
-                f"{', '.join(ignored)}: without effect, --inference plays what the run was trained in"
-            )
-    elif flags.deterministic:
-        said.append("--deterministic has no effect without --inference: training samples its actions")
-
-    if resumes(settings.run) and not run["checkpoint_settings.inference"]:
-        fixed = _KEPT if run["env_settings.env_path"] is not None else (*_KEPT, *_OF_PLAYERS)
-        kept = [learn_flags.flag_of(key) for key in fixed if key in flags.given]
-        kept += [line for line in flags.options if _is_kept(line.partition("=")[0].lstrip("+"))]
-        if kept:
-            said.append(f"{', '.join(kept)}: without effect, a resumed run keeps its own")
-
-    if resumes(settings.run) and run["checkpoint_settings.initialize_from"] is not None:
-        where = run.where("checkpoint_settings.initialize_from")
-        said.append(f"{where} has no effect: the run is resumed with its own networks")
-    return said
-
-
-def _is_kept(name: str) -> bool:
-    """Return whether a resumed run keeps its own value of an option; what it begins with is no matter."""
-    return name in _FIXED or name.rpartition(".")[2] == "init_from"
 
 
 def _composed(lines: list[str]) -> Config:
@@ -188,7 +151,7 @@ def _run_lines(
         translated = [*translated, *lines_over(settings, saved, own, _tell)]
         options = [*translated, *own]
         names = [line.partition("=")[0] for line in options]
-        kept = [line for name, line in zip(names, options) if not _is_kept(name)]
+        kept = [line for name, line in zip(names, options) if not is_kept(name)]
         return [*kept, f"resume={quoted_path(folder)}"]
 
     options = [*translated, *own]
