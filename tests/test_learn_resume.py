@@ -7,10 +7,12 @@ from mappo_unity.cli import learn
 from mappo_unity.config.compose import compose_config, load_config
 from mappo_unity.config.mlagents.flags import parse_flags
 from mappo_unity.config.mlagents.read import read_settings
+from mappo_unity.config.mlagents.resolved import resolved
 from mappo_unity.config.mlagents.translate import translate
 from mappo_unity.config.per_behavior import behavior_config
 from mappo_unity.runs.folder import CONFIG, write_record
 from mappo_unity.runs.options import compose_resumed
+from mappo_unity.runs.results import write_configuration
 
 TWO = """
 behaviors:
@@ -40,6 +42,7 @@ def resumed(tmp_path, before, after, own=(), now=(), env="--env=scene:StrikersVs
     folder = tmp_path / "results" / "first"
     folder.mkdir(parents=True, exist_ok=True)
     write_record(folder, compose_config(lines).config, lines)
+    write_configuration(folder, resolved(settings_of(tmp_path, before, env)))
 
     settings = settings_of(tmp_path, after, "--run-id=first", "--resume")
     lines = learn._run_lines(settings, translate(settings).lines, list(now), folder, resume=True)
@@ -51,6 +54,18 @@ def test_the_same_file_changes_nothing(tmp_path, capsys, text):
     saved, config = resumed(tmp_path, text, text)
     assert config == saved
     assert capsys.readouterr().err == ""
+
+
+def test_with_the_same_file_what_the_command_line_gave_stays(tmp_path, capsys):
+    own = ["env.params.gravity=3", "behaviors.Goalie.ppo.lr=0.5"]
+    alike = TWO.replace("0.0001", "0.0003")
+    saved, config = resumed(tmp_path, alike, alike, own=own)
+    assert config == saved and capsys.readouterr().err == ""
+    assert config.env.params["gravity"] == 3 and behavior_config(config, "Goalie").ppo.lr == 0.5
+
+    # a parameter that no file ever named stays in any case
+    _, config = resumed(tmp_path, TWO + PARAMETERS, TWO, own=["env.params.wind=3"])
+    assert config.env.params["wind"] == 3 and "gravity" not in config.env.params
 
 
 def test_what_a_behavior_no_longer_has_of_its_own_is_that_of_all(tmp_path):

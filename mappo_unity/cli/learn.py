@@ -56,7 +56,7 @@ def run(lines: list[str]) -> int:
     for key in given_options(own):  # its value comes from the command line
         if key in _PLACES:
             raise ConfigError(f"{key} does not go with mappo-learn, whose flag is {_PLACES[key]}")
-        translation.sources.pop(key, None)
+        translation.forget(key)
 
     options = [*translation.lines, *own]
     try:
@@ -129,7 +129,7 @@ def _run_lines(
     from mappo_unity.config.schema import Backend
     from mappo_unity.config.text_lines import quoted_path
     from mappo_unity.runs.folder import CONFIG
-    from mappo_unity.runs.results import LOGS
+    from mappo_unity.runs.results import LOGS, read_configuration
 
     if resume:
         saved, path = load_config(folder / CONFIG), settings.run["env_settings.env_path"]
@@ -148,7 +148,8 @@ def _run_lines(
             )
         elif env.backend is Backend.editor:
             translated = [*translated, "env.backend=player"]
-        translated = [*translated, *lines_over(settings, saved, own, _tell)]
+        before = read_configuration(folder)
+        translated = [*translated, *lines_over(settings, before, saved, own, _tell)]
         options = [*translated, *own]
         names = [line.partition("=")[0] for line in options]
         kept = [line for name, line in zip(names, options) if not is_kept(name)]

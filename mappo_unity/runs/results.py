@@ -137,6 +137,15 @@ def write_configuration(folder: Path, configuration: Mapping[str, Any]) -> None:
     write_atomically(folder / CONFIGURATION, text.encode())
 
 
+def read_configuration(folder: Path) -> dict[str, Any]:
+    """Return what `write_configuration` wrote for a run; nothing where it is missing or cannot be read."""
+    try:
+        found = yaml.safe_load((folder / CONFIGURATION).read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def publish(
     folder: Path, checkpoint: Path | None, policies: Sequence[str], reward: float, steps: int
 ) -> list[Path]:

@@ -41,6 +41,13 @@ class Translation:
     places: Callable[[str, str], str] = lambda name, rest: ""
     """See `Settings.places`."""
 
+    def forget(self, key: str) -> None:
+        """Take note that the command line gives an option, or a part of an environment parameter."""
+        for name in [name for name in self.sources if name.startswith(_PARAMETERS)]:
+            if f"{key}.".startswith(f"{name}.") or f"{key}." == _PARAMETERS:
+                del self.sources[name]
+        self.sources.pop(key, None)
+
     def explain(self, error: ConfigError) -> ConfigError:
         """Return an error about an option with the place that it comes from in front."""
         text = self._with_place(str(error))

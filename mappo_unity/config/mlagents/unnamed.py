@@ -6,9 +6,12 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import yaml
+
 from mappo_unity.config.behavior_lines import dotted_options, written
 from mappo_unity.config.compose import compose_tree
 from mappo_unity.config.mlagents.behavior import Options, learner_options, nested
+from mappo_unity.config.mlagents.resolved import resolved
 from mappo_unity.config.mlagents.settings import Settings
 from mappo_unity.config.presets import group_choices
 from mappo_unity.config.schema import Config
@@ -41,11 +44,20 @@ def check_named(settings: Settings, config: Config, own: list[str]) -> None:
         )
 
 
-def lines_over(settings: Settings, saved: Config, own: list[str], tell: Callable[[str], None]) -> list[str]:
-    """Return lines with which the file rules over what a run that is resumed has and its lines do not name.
+def lines_over(
+    settings: Settings,
+    before: Mapping[str, Any],
+    saved: Config,
+    own: list[str],
+    tell: Callable[[str], None],
+) -> list[str]:
+    """Return lines with which a changed file rules over what a resumed run has and its lines do not name.
+
+    What the command line gave the run stays as long as the file is the same.
 
     Args:
         settings: the file and the flags.
+        before: the settings that the run had (`resolved`); empty: they are not known.
         saved: the run's own options.
         own: options of the command line.
         tell: takes a line for the user about each environment parameter that the run loses, or keeps.
@@ -54,12 +66,15 @@ def lines_over(settings: Settings, saved: Config, own: list[str], tell: Callable
         return []  # there is no file
 
     lines = []
+    now = yaml.safe_load(yaml.safe_dump(resolved(settings)))  # as it is read
+    is_changed = bool(before) and any(before.get(key) != now[key] for key in (_BEHAVIORS, "default_settings"))
     # lines name what differs from the options of all: what differs no longer would stay as it was
     learners = {name: nested(options) for name, options in _learners(settings, saved) if options}
-    if learners:
+    if learners and is_changed:
         lines.append(f"{_BEHAVIORS}={written(learners)}")
 
-    for name in _dropped_parameters(settings, saved, own):
+    were_named = before.get("environment_parameters") or {}
+    for name in [name for name in _dropped_parameters(settings, saved, own) if name in were_named]:
         is_gone = _DELETABLE.fullmatch(name) is not None
         if is_gone:
             lines.append(f"~{_PARAMETERS}.{name}")
