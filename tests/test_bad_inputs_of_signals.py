@@ -85,7 +85,7 @@ TOLD = [
     (f"train env=Basic {ONLY} stop_at_return=1", "stop_at_return=1 does not go with bc.only=true"),
     (
         f"train env=Basic {ONLY} ppo.critic_warmup_steps=9",
-        "ppo.critic_warmup_steps=9 does not go with bc.only=true",
+        "ppo.critic_warmup_steps=9 has no effect with bc.only=true",
     ),
     (
         f"train env=Basic {ONLY} matches.interval=9",

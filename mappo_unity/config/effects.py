@@ -84,10 +84,11 @@ def _message(key: str, value: Any, backends: list[Backend], needed: tuple[Backen
 
 
 def _check_teachers(given: list[str], configs: list[Config]) -> None:
-    """Refuse options of reward streams and of cloning that nobody learns from."""
+    """Refuse options of reward streams, of their critic and of cloning that nobody learns from."""
     if all(config.bc.only for config in configs):
         for key in given:
-            if key.startswith("rewards.") and _is_changed(key, configs):
+            is_idle = key.startswith("rewards.") or key == "ppo.critic_warmup_steps"
+            if is_idle and _is_changed(key, configs):
                 raise ConfigError(
                     f"{_shown(key, configs[0])} has no effect with bc.only=true, which "
                     "learns from the demonstrations alone; leave one of the two out"

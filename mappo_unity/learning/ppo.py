@@ -127,7 +127,7 @@ class PolicyLearner:
             metrics |= self.rewards.learn()
             self.prepared = None
             self.rows.forget()
-        if self.cloning is not None and not self.warmup.active:
+        if self.cloning is not None and (self.cloning.cfg.only or not self.warmup.active):
             metrics |= self.cloning.learn(int(batch.get(keys.ACTING).sum()), settings["lr"], progress)
         if not self.round_norms:
             # after the update, which must not see it

@@ -138,12 +138,6 @@ class Config:
         if not self.bc.demos and not any(bc.get("demos") for bc in own if isinstance(bc, dict)):
             raise ConfigError("bc.only=true needs demonstrations: bc.demos=[expert.demo]")
 
-        steps = self.ppo.critic_warmup_steps
-        if steps:
-            raise ConfigError(
-                f"ppo.critic_warmup_steps={steps} does not go with bc.only=true, where no critic learns; "
-                "leave it out"
-            )
         lessons = curricula(self.env.parameters)
         if lessons:
             raise ConfigError(
