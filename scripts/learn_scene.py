@@ -26,6 +26,9 @@ from typing import Any, TypeVar
 import yaml
 from run_script import positive, run_script
 
+from mappo_unity.config.renamed import rename_lines
+from mappo_unity.config.schema import Config
+from mappo_unity.config.text_lines import literal_lines
 from mappo_unity.errors import ConfigError
 from mappo_unity.runs.checkpoint_file import checkpoints_in
 from mappo_unity.runs.folder import OVERRIDES
@@ -74,6 +77,7 @@ def begin_or_resume(scene: str, seed: int, folder: Path, options: list[str]) -> 
         return asked
 
     begun = begun_with(folder)
+    asked = literal_lines(rename_lines(asked), Config)  # as mappo-train notes them
     if begun is not None and set(without_place(begun)) != set(without_place(asked)):
         here, there = (" ".join(without_place(lines)) for lines in (asked, begun))
         raise ConfigError(
@@ -86,7 +90,7 @@ def begin_or_resume(scene: str, seed: int, folder: Path, options: list[str]) -> 
 def begun_with(folder: Path) -> list[str] | None:
     """Return the options with which a run was begun; None: its record does not say."""
     path = folder / OVERRIDES
-    entries = yaml.safe_load(path.read_text()) if path.is_file() else []
+    entries = (yaml.safe_load(path.read_text()) if path.is_file() else None) or []
     calls: list[list[str]] = [entry["overrides"] for entry in entries]
     begins = [lines for lines in calls if not any(line.startswith("resume=") for line in lines)]
     return begins[-1] if begins else None

@@ -290,12 +290,13 @@ def test_a_player_is_found_in_a_folder_of_any_letters(folder: str, name: str, tm
         ("b/Other", "b/Other.x86_64"),
         ("my.app.builds/Game", None),
         ("linux/Game.exe", "linux/Game"),  # as ML-Agents takes it
+        ("b/Both.exe", "b/Both.x86_64"),  # the build for this system beside that for another one
     ],
 )
 def test_a_player_of_just_that_name_is_taken(name: str, found: str | None, tmp_path: Path) -> None:
     for player in (
         *("linux.x86_64/Game.x86_64", "linux/Game", "b/Game", "b/Game.x86", "b/Game.x86_64"),
-        *("b/Other.x86", "b/Other.x86_64", "my.app.builds/Game"),
+        *("b/Other.x86", "b/Other.x86_64", "b/Both.exe", "b/Both.x86_64", "my.app.builds/Game"),
     ):
         path = tmp_path / player
         path.parent.mkdir(exist_ok=True)

@@ -21,6 +21,8 @@ from mappo_unity.config.overrides import shell_word
 from mappo_unity.errors import ConfigError
 from mappo_unity.protocol.player_failures import PlayerFailure
 
+_EXTENSIONS = (".app", ".exe", ".x86_64", ".x86")  # of all systems' players
+
 _DIE_WITH_PARENT = """
 import ctypes, os, sys
 ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
@@ -87,8 +89,13 @@ def find_executable(file_name: str, option: str = "env.file_name") -> Path:
 
 
 def _exactly(path: Path) -> str | None:
-    """Return the file that a path names, as it is or with this system's extension; None if there is none."""
-    extensions = {"darwin": (), "win32": (".exe",)}.get(sys.platform, (".x86_64", ".x86"))
+    """Return the file that a path names, as it is or with this system's extension; None if there is none.
+
+    A name with another system's extension means the build for this one, which may lie beside that.
+    """
+    extensions = {"darwin": (".app",), "win32": (".exe",)}.get(sys.platform, (".x86_64", ".x86"))
+    if path.suffix in _EXTENSIONS and path.suffix not in extensions:
+        return None
     names = [f"{path}{extension}" for extension in ("", *extensions)]
     return next(filter(os.path.isfile, names), None)
 

@@ -55,9 +55,11 @@ def _name(model: Path) -> str:
 def _goes_as_it_is(readme: Path, models: Sequence[Path]) -> bool:
     if not readme.is_file():
         return False
-    if not any(map(_own_card, models)):
+    text = readme.read_text(encoding="utf-8", errors="replace")
+    if not is_ours(text):
         return True
-    return not is_ours(readme.read_text(encoding="utf-8", errors="replace"))
+    # one of ours, unless a file has a card of its own or has come later
+    return not any(map(_own_card, models)) and all(_name(model) in text for model in models)
 
 
 def _own_card(model: Path) -> Path | None:

@@ -32,6 +32,7 @@ class CheckpointSaver:
         self._cfg, self._folder, self._state, self._exports = cfg, folder, state, exports
         self.last = last
         self._resumed = last is not None
+        self._has_exported = False
         self._saved_iteration = state.iteration if last else None
         self._complete: dict[str, Any] | None = None  # the last iteration that this process completed
 
@@ -107,8 +108,9 @@ class CheckpointSaver:
         self.export()
 
     def export(self) -> None:
-        """Export the best and the last checkpoint, which are written."""
-        if self._exports is not None:
+        """Export the best and the last checkpoint, which are written; not again what was broken off."""
+        if self._exports is not None and not self._has_exported:
+            self._has_exported = True
             self._exports.finish(self.last)
 
     def rescue(self, say: Callable[[str], None]) -> None:

@@ -81,11 +81,14 @@ class BatchCollector:
             return self._with_records(self._play(self._cfg.rounds))
 
         parts: list[TensorDictBase] = []
-        missing = self._cfg.batch_size
+        missing, rate = self._cfg.batch_size, self._expected()
         while missing > 0:
             # not everybody is asked in every round: what is missing then is played in further parts
-            parts.append(self._play(-(-missing // max(1, self._expected()))))
-            missing -= count_decisions(parts[-1], self._env.sides)
+            parts.append(self._play(-(-missing // max(1, rate))))
+            decisions = count_decisions(parts[-1], self._env.sides)
+            missing -= decisions
+            # as many as are there now, or as the last part had in a round
+            rate = max(self._present()[0], -(-decisions // len(parts[-1])))
 
         return self._with_records(parts[0] if len(parts) == 1 else torch.cat(parts, 0))
 
@@ -95,16 +98,19 @@ class BatchCollector:
         self._collector.reset_at_each_iter = True  # hands out what the reset has brought
 
     def _expected(self) -> int:
-        """Return how many agents of the learners a round may hold: those there now, or half of their slots.
+        """Return how many agents of the learners a first round may hold: those now, or half of their slots.
 
         Few may be there for a moment only: where all but one have died, the next round may bring all back,
         and rounds for one would make a batch many times too large. Where few stay, further parts follow.
         """
-        if self._opponents is not None:
-            present, slots = count_learning(self._env, self._opponents)
-        else:
-            present, slots = count_present(self._env), count_slots(self._env)
+        present, slots = self._present()
         return max(present, slots // 2)
+
+    def _present(self) -> tuple[int, int]:
+        """Return how many agents of the learners are there now, and how many slots these have."""
+        if self._opponents is not None:
+            return count_learning(self._env, self._opponents)
+        return count_present(self._env), count_slots(self._env)
 
     def _play(self, rounds: int) -> TensorDictBase:
         self._collector.frames_per_batch = self._collector.requested_frames_per_batch = rounds
