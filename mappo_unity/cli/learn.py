@@ -20,7 +20,7 @@ from mappo_unity.signals import interrupts_wait
 if TYPE_CHECKING:
     from mappo_unity.config.mlagents.settings import Settings
     from mappo_unity.config.mlagents.translate import Translation
-    from mappo_unity.config.schema import Config
+    from mappo_unity.config.schema import Config, EnvConfig
 
 _SEEDS = 10_000  # of those that ML-Agents draws where none is given
 _MOST_ROLLED_BACK = 4
@@ -123,37 +123,12 @@ def _run_lines(
     settings: Settings, translated: list[str], own: list[str], folder: Path, resume: bool
 ) -> list[str]:
     """Return all lines of a run: below the options where it goes and what it begins with."""
-    from mappo_unity.config.compose import load_config
-    from mappo_unity.config.mlagents.unnamed import lines_over
     from mappo_unity.config.overrides import last_value
-    from mappo_unity.config.schema import Backend
     from mappo_unity.config.text_lines import quoted_path
-    from mappo_unity.runs.folder import CONFIG
-    from mappo_unity.runs.results import LOGS, read_configuration
+    from mappo_unity.runs.results import LOGS
 
     if resume:
-        saved, path = load_config(folder / CONFIG), settings.run["env_settings.env_path"]
-        env = saved.env
-        is_scene = env.backend is Backend.embedded
-        if path is None:  # where it was trained, not the Editor
-            other = _OF_SCENES if is_scene else _OF_PLACES
-            translated = [line for line in translated if not other.match(line)]
-        elif scene_of(settings) != (env.name if is_scene else None):
-            trained = f"the embedded scene {env.name}" if is_scene else "a build or in the Editor"
-            here = f"--env=scene:{env.name}" if is_scene else "leave it out, or name a build"
-            where = settings.run.where("env_settings.env_path")
-            raise ConfigError(
-                f"{where}: the run in {folder} was trained in {trained} and goes on there: {here}, or start "
-                f"a run with another --run-id and --initialize-from={folder.name}"
-            )
-        elif env.backend is Backend.editor:
-            translated = [*translated, "env.backend=player"]
-        before = read_configuration(folder)
-        translated = [*translated, *lines_over(settings, before, saved, own, _tell)]
-        options = [*translated, *own]
-        names = [line.partition("=")[0] for line in options]
-        kept = [line for name, line in zip(names, options) if not is_kept(name)]
-        return [*kept, f"resume={quoted_path(folder)}"]
+        return _resumed_lines(settings, translated, own, folder)
 
     options = [*translated, *own]
     lines = [f"hydra.run.dir={quoted_path(folder)}", *_beginning(settings)]
@@ -161,9 +136,53 @@ def _run_lines(
         seed = random.SystemRandom().randrange(_SEEDS)
         _tell(f"no seed is given: seed={seed} is drawn")
         lines.append(f"seed={seed}")
+
     if scene_of(settings) is None and settings.run["env_settings.env_path"] is not None:
         lines.append(f"env.player_logs={quoted_path(folder / LOGS)}")
     return [*lines, *options]
+
+
+def _resumed_lines(settings: Settings, translated: list[str], own: list[str], folder: Path) -> list[str]:
+    """Return all lines of a run that is resumed: without those of which it keeps its own."""
+    from mappo_unity.config.compose import load_config
+    from mappo_unity.config.mlagents.unnamed import lines_over
+    from mappo_unity.config.text_lines import quoted_path
+    from mappo_unity.runs.folder import CONFIG
+    from mappo_unity.runs.results import read_configuration
+
+    saved = load_config(folder / CONFIG)
+    placed = _where_trained(settings, translated, saved.env, folder)
+    over = lines_over(settings, read_configuration(folder), saved, own, _tell)
+
+    options = [*placed, *over, *own]
+    names = [line.partition("=")[0] for line in options]
+    kept = [line for name, line in zip(names, options) if not is_kept(name)]
+    return [*kept, f"resume={quoted_path(folder)}"]
+
+
+def _where_trained(settings: Settings, translated: list[str], env: EnvConfig, folder: Path) -> list[str]:
+    """Return the file's lines with those of the place where a run was trained, which goes on there.
+
+    Raises:
+        ConfigError: the flags say another scene, or a build where it was a scene.
+    """
+    from mappo_unity.config.schema import Backend
+
+    is_scene = env.backend is Backend.embedded
+    if settings.run["env_settings.env_path"] is None:  # where it was trained, not the Editor
+        other = _OF_SCENES if is_scene else _OF_PLACES
+        return [line for line in translated if not other.match(line)]
+
+    if scene_of(settings) != (env.name if is_scene else None):
+        trained = f"the embedded scene {env.name}" if is_scene else "a build or in the Editor"
+        here = f"--env=scene:{env.name}" if is_scene else "leave it out, or name a build"
+        where = settings.run.where("env_settings.env_path")
+        raise ConfigError(
+            f"{where}: the run in {folder} was trained in {trained} and goes on there: {here}, or start "
+            f"a run with another --run-id and --initialize-from={folder.name}"
+        )
+
+    return [*translated, "env.backend=player"] if env.backend is Backend.editor else translated
 
 
 def _beginning(settings: Settings) -> list[str]:

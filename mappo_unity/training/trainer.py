@@ -134,9 +134,7 @@ def _iterate(
 ) -> str:
     """Iterate until the steps are done, the return is reached or a signal comes; return the status."""
     if state.agent_steps >= cfg.max_steps and state.matches.is_missing:
-        state.play_matches()
-        saver.add_series()  # its iteration's row stays without it
-        log.message(state.matches.said)
+        _play_missing_series(state, saver, log)
 
     status = _status(cfg, state, stop)
     while status is None:
@@ -173,6 +171,13 @@ def _iterate(
     # the loop is over: the timer of a first signal must not break off the last checkpoint
     stop.end_patience()
     return status
+
+
+def _play_missing_series(state: RunState, saver: CheckpointSaver, log: RunLog) -> None:
+    """Play the last series of matches of a run, which was broken off; its iteration's row stays as it is."""
+    state.play_matches()
+    saver.add_series()
+    log.message(state.matches.said)
 
 
 def _play_series(

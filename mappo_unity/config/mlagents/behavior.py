@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mappo_unity.config.mlagents.keys import SIGNALS
@@ -92,10 +92,15 @@ def team_change(section: Section) -> int:
     return 5 * section["self_play.save_steps"] if given is None else given
 
 
-def nested(options: Options) -> dict[str, Any]:
-    """Return the values of options by section: {ppo: {lr: 1e-4}}."""
+def values_of(options: Options) -> dict[str, Any]:
+    """Return options without the places that they come from."""
+    return {key: value for key, (value, _) in options.items()}
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by section: {ppo: {lr: 1e-4}}."""
     tree: dict[str, Any] = {}
-    for key, (value, _) in options.items():
+    for key, value in values.items():
         inside = tree
         *above, last = key.split(".")
         for part in above:

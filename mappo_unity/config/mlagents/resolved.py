@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mappo_unity.config.mlagents.behavior import team_change
+from mappo_unity.config.mlagents.behavior import nested, team_change
 from mappo_unity.config.mlagents.keys import OPTIONAL, RUN, SIGNALS
 from mappo_unity.config.mlagents.settings import Section, Settings
 
@@ -31,14 +31,10 @@ def _in_force(section: Section) -> list[str]:
 
 
 def _nested(section: Section, keys: list[str]) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
-    for key in keys:
-        *above, last = key.split(".")
-        inside = tree
-        for part in above:
-            inside = inside.setdefault(part, {})
-        if key == "self_play.team_change":  # whose default follows from another key
-            inside[last] = team_change(section)
-        else:
-            inside[last] = section[key] if key in section.table else None
-    return tree
+    return nested({key: _value(section, key) for key in keys})
+
+
+def _value(section: Section, key: str) -> Any:
+    if key == "self_play.team_change":  # whose default follows from another key
+        return team_change(section)
+    return section[key] if key in section.table else None

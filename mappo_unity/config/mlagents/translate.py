@@ -15,6 +15,7 @@ from mappo_unity.config.mlagents.behavior import (
     learner_options,
     nested,
     team_change,
+    values_of,
 )
 from mappo_unity.config.mlagents.environment import MANY, environment_options
 from mappo_unity.config.mlagents.settings import Section, Settings, as_number
@@ -201,7 +202,7 @@ def _learners(sections: dict[str, Section], default: Section | None) -> tuple[Op
         if _PLAIN_NAME.fullmatch(name) and differing:
             out |= {f"behaviors.{name}.{key}": value for key, value in differing.items()}
         else:  # a name with dots and the like, or a behavior that is only named
-            trees[name] = nested(differing)
+            trees[name] = nested(values_of(differing))
             sources |= {f"behaviors.{name}.{key}": where for key, (_, where) in differing.items()}
     if trees:
         out["behaviors"] = (trees, "behaviors")

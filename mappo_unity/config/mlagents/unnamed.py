@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 import yaml
 
 from mappo_unity.config.behavior_lines import dotted_options, written
 from mappo_unity.config.compose import compose_tree
-from mappo_unity.config.mlagents.behavior import Options, learner_options, nested
+from mappo_unity.config.mlagents.behavior import learner_options, nested, values_of
 from mappo_unity.config.mlagents.resolved import resolved
 from mappo_unity.config.mlagents.settings import Settings
 from mappo_unity.config.presets import group_choices
@@ -69,12 +69,12 @@ def lines_over(
     now = yaml.safe_load(yaml.safe_dump(resolved(settings)))  # as it is read
     is_changed = bool(before) and any(before.get(key) != now[key] for key in (_BEHAVIORS, "default_settings"))
     # lines name what differs from the options of all: what differs no longer would stay as it was
-    learners = {name: nested(options) for name, options in _learners(settings, saved) if options}
-    if learners and is_changed:
+    learners = dict(_learners(settings, saved)) if is_changed else {}
+    if learners:
         lines.append(f"{_BEHAVIORS}={written(learners)}")
 
     were_named = before.get("environment_parameters") or {}
-    for name in [name for name in _dropped_parameters(settings, saved, own) if name in were_named]:
+    for name in _dropped_parameters(settings, were_named, saved, own):
         is_gone = _DELETABLE.fullmatch(name) is not None
         if is_gone:
             lines.append(f"~{_PARAMETERS}.{name}")
@@ -83,25 +83,37 @@ def lines_over(
     return lines
 
 
-def _learners(settings: Settings, saved: Config) -> Iterator[tuple[str, Options]]:
-    """Yield each behavior's options that the saved run has for it alone, with the file's values."""
+def _learners(settings: Settings, saved: Config) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield each behavior's options that the saved run has for it alone, nested, with the file's values."""
     for name, tree in saved.behaviors.items():
         section = settings.behaviors.get(name, settings.default)
         if section is not None:
-            options = learner_options(name, section)
-            options.pop("init_from", None)  # a resumed run has its own networks
-            yield name, {key: value for key, value in options.items() if _holds(tree, key)}
+            values = values_of(learner_options(name, section))
+            values.pop("init_from", None)  # a resumed run has its own networks
+            held = {key: value for key, value in values.items() if _holds(tree, key)}
+            if held:
+                yield name, nested(held)
 
 
-def _dropped_parameters(settings: Settings, saved: Config, own: list[str]) -> list[str]:
-    """Return the saved run's environment parameters that the file, the options and the preset do not name."""
+def _dropped_parameters(
+    settings: Settings, were_named: Collection[str], saved: Config, own: list[str]
+) -> list[str]:
+    """Return the environment parameters that the file named, and file, options and preset name no more."""
+    names = [
+        name
+        for name in saved.env.params
+        if name in were_named
+        and name not in settings.parameters
+        and not _is_given(f"{_PARAMETERS}.{name}", own)
+    ]
+    if not names:  # composing a preset takes a while
+        return []
+
     preset = [line for line in own if line.startswith("parameters=")]
     if saved.env.name in group_choices()["env"]:  # env.name may be any name
         preset.append(f"env={saved.env.name}")
-    known = {*settings.parameters, *compose_tree(preset).env.params}
-    return [
-        name for name in saved.env.params if name not in known and not _is_given(f"{_PARAMETERS}.{name}", own)
-    ]
+    known = compose_tree(preset).env.params
+    return [name for name in names if name not in known]
 
 
 def _is_given(option: str, lines: list[str]) -> bool:
