@@ -28,7 +28,6 @@ from mappo_unity.learning.imitation.cloning import Cloning
 from mappo_unity.learning.loss import ACTOR_LEARNS, MaskedClipPPOLoss, move_with_minibatch
 from mappo_unity.learning.networks.actor_critic import UnityActor, bounded_actors, value_layers
 from mappo_unity.learning.networks.encoders import channels_first, running_norms, update_norms
-from mappo_unity.learning.networks.poca import PocaCritic
 from mappo_unity.learning.optimizer import (
     CriticWarmup,
     LearningRates,
@@ -81,9 +80,8 @@ class PolicyLearner:
         inputs = [str(key) for net in (actor, critic) for key in net.in_keys]
         written = [keys.ACTION, keys.LOG_PROB] + [keys.LOG_PROBS] * actor.keeps_components
         self.row_keys = list(dict.fromkeys([*inputs, *written]))
-        self.has_baseline = any(isinstance(m, PocaCritic) for m in critic.modules())
         read = self.row_keys + [keys.FIRST] * actor.is_recurrent
-        self.carried = CarriedRounds(read, self.has_baseline, channels_first(critic))
+        self.carried = CarriedRounds(read, self.reader.has_baseline, channels_first(critic))
         self.rows = make_rows(self.row_keys, critic, cfg)
 
         self.prepared: PreparedBatch | None = None  # while it is learnt, with ppo.recompute_advantages

@@ -38,13 +38,15 @@ class ValueReader:
     Args:
         critic: see `learning.networks.actor_critic.make_critic`.
         norm: turns its output into the reward's scale.
+
+    Attributes: `has_baseline`, whether it is MA-POCA's, which reads actions.
     """
 
     def __init__(self, critic: TensorDictModule, norm: ValueNorm) -> None:
         self.critic, self.norm = critic.module, norm
         self.keys = [str(key) for key in critic.in_keys]
         self.traces = next((m for m in critic.modules() if isinstance(m, ObservationTraces)), None)
-        self._reads_actions = any(isinstance(m, PocaCritic) for m in critic.modules())
+        self.has_baseline = any(isinstance(m, PocaCritic) for m in critic.modules())
         self.states: dict[str, Tensor] = {}  # [..., A, M], before the next batch's first row
         self._before: dict[str, Tensor] = {}  # those before the batch that was read last
 
@@ -87,18 +89,22 @@ class ValueReader:
         Args:
             batch: ``[T, ..., A]``, as collected.
         """
-        if not self._reads_actions:
+        if not self.has_baseline:
             return batch
 
         acting, drawn = batch.get(keys.ACTING), batch.get(keys.ACTION)
         waits = batch.get(keys.PRESENT) & ~batch.get(keys.DEPARTED) & ~acting
+        if not bool(waits.any()):  # whoever comes later is asked first
+            self.states[keys.ACTION] = drawn[-1]
+            return batch
+
         under_way, rows = self._state(keys.ACTION, drawn[0], drawn.shape[-1]), []
         for asked, waiting, action in zip(acting, waits, drawn, strict=True):
             under_way = torch.where(asked, action, under_way)
             rows.append(torch.where(waiting, under_way, action))
 
         self.states[keys.ACTION] = under_way
-        return batch.copy().set(keys.ACTION, torch.stack(rows)) if bool(waits.any()) else batch
+        return batch.copy().set(keys.ACTION, torch.stack(rows))
 
     @torch.no_grad()
     def read(self, rounds: TensorDict, following: TensorDictBase) -> Values:

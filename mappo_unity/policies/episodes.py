@@ -15,9 +15,9 @@ from mappo_unity.policies.policy import Policy
 from mappo_unity.scenes.contract.records import RecordCheck
 from mappo_unity.scenes.contract.rules import (
     MAX_SILENT_STEPS,
-    EnvironmentDataError,
     check_silence,
     check_specs,
+    late_behavior,
 )
 from mappo_unity.scenes.contract.statistics import pop_statistics
 
@@ -115,10 +115,7 @@ def _actor(policy: Policy | dict[str, Policy], behavior: str) -> Policy:
     if not isinstance(policy, dict):
         return policy
     if behavior not in policy:
-        raise EnvironmentDataError(
-            f"behavior {behavior!r} appeared after the start, when there were {list(policy)}: neither side "
-            "plays it; let every behavior have an active agent at first"
-        )
+        raise late_behavior(behavior, policy, "neither side plays it")
     return policy[behavior]
 
 

@@ -62,6 +62,7 @@ def export_checkpoint(path: Path, out: Path | None = None) -> list[Exported]:
         policy = CheckpointPolicy(path, deterministic=True)
 
     state = checkpoint.load(path)
+    samples = _samples(path, state)
     paths = _output_paths(list(policy.layout), path, out)
 
     written = []
@@ -71,7 +72,7 @@ def export_checkpoint(path: Path, out: Path | None = None) -> list[Exported]:
         data = build_model(actor[0].module, layout["sensors"], name, metadata).SerializeToString()
 
         # What cannot be compared is refused, before anything is written.
-        sample = _samples(path, state).get(name, {})
+        sample = samples.get(name, {})
         rows = len(next(iter(sample.values()), ()))
         if not rows:
             raise ExportError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def upload_of(path: Path) -> dict[str, Path | bytes]:
         files[name] = model
 
     films = _films(path, models)
-    if path.is_dir() and _goes_as_it_is(path / README, models):
+    if path.is_dir() and _goes_as_it_is(path / README, files):
         return {**files, README: path / README, **films}
     cards = [_card(model, name) for name, model in files.items()]
     return {**files, README: merged(cards).encode(), **films}
@@ -52,14 +52,14 @@ def _name(model: Path) -> str:
     return file_name(behavior) if behavior else model.name
 
 
-def _goes_as_it_is(readme: Path, models: Sequence[Path]) -> bool:
+def _goes_as_it_is(readme: Path, files: Mapping[str, Path]) -> bool:
     if not readme.is_file():
         return False
     text = readme.read_text(encoding="utf-8", errors="replace")
     if not is_ours(text):
         return True
     # one of ours, unless a file has a card of its own or has come later
-    return not any(map(_own_card, models)) and all(_name(model) in text for model in models)
+    return not any(map(_own_card, files.values())) and all(name in text for name in files)
 
 
 def _own_card(model: Path) -> Path | None:

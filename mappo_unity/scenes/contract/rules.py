@@ -7,7 +7,7 @@ the agents send.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -115,11 +115,16 @@ def check_same_specs(specs: Any, first: Mapping[str, BehaviorSpec]) -> None:
 
     for name in specs:
         if name not in first:
-            raise EnvironmentDataError(
-                f"behavior {name!r} appeared after the start, when there were {list(first)}: "
-                "its networks cannot be made any more; every behavior must request a decision in the first "
-                "step after the reset, or be in behavior_specs from then on"
-            )
+            raise late_behavior(name, first, "its networks cannot be made any more")
+
+
+def late_behavior(name: str, first: Iterable[str], reason: str) -> EnvironmentDataError:
+    """Return the error of a behavior that was not among the `first` ones, and why nobody can play it."""
+    return EnvironmentDataError(
+        f"behavior {name!r} appeared after the start, when there were {list(first)}: {reason}; "
+        "every behavior must request a decision in the first step after the reset, or be in behavior_specs "
+        "from then on"
+    )
 
 
 def check_plain(value: Any, where: str) -> None:
